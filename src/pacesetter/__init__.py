@@ -1,0 +1,24 @@
+"""Train ensembles of agents that learn to walk, and prove what the ensemble is worth."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pacesetter.evaluate import evaluate
+    from pacesetter.policy import load
+    from pacesetter.training.trainer import Trainer
+
+__all__ = ["Trainer", "evaluate", "load"]
+_HOMES = {
+    "Trainer": "pacesetter.training.trainer",
+    "evaluate": "pacesetter.evaluate",
+    "load": "pacesetter.policy",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import lazily, so that a policy file is used without JAX."""
+    from importlib import import_module
+
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pacesetter' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,0 +1,85 @@
+"""The whole contract between an algorithm and the trainer.
+
+Axes: K members, U updates a cycle, B batch, T time, E environments, N networks in one learner.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+from pacesetter.policy import Actors
+
+Array = jax.Array
+State = Any
+Memory = Any
+
+
+class Spec(NamedTuple):
+    """Sizes of the task's vectors; actions are in [-1, 1] on this side of the env border."""
+
+    observation_size: int
+    action_size: int
+
+
+class Batch(NamedTuple):
+    """What one `update` learns from: (U, B, ...) off-policy, or a rollout (T, E, ...) on-policy."""
+
+    observation: Array
+    action: Array
+    reward: Array
+    next_observation: Array
+    discount: Array  # gamma**n * (1 - terminated)
+    last: Array  # the episode ended here: terminated or truncated
+    weight: Array  # importance, 1 if drawn uniformly
+    mask: Array  # (..., N) bootstrap columns, stored with the row; N may be 0
+    starts: Array | None = None  # reset observations, for imagined rollouts
+    valid: Array | None = None  # valid rows of a padded ring
+
+
+class Update(NamedTuple):
+    """What one `update` gives back."""
+
+    state: State
+    losses: dict[str, Array]  # scalars; anything not finite stops the run
+    error: Array  # (U, B) absolute errors, which a prioritised replay takes as feedback
+
+
+class Algorithm(Protocol):
+    """One member's learner: pure functions, no env, no files. The trainer alone lifts it to K.
+
+    A state is a NamedTuple; the fields named `*_optimizer` and `updates` are its optimiser, and
+    `actor` with `target_actor` its policy, which is all that a partial copy needs to know. It never
+    holds a random key: clones that shared one would stay equal for ever.
+    """
+
+    @property
+    def masks(self) -> int:
+        """Bootstrap columns N of a replay row."""
+        ...
+
+    @property
+    def cycle(self) -> int:
+        """U, the critic updates of one call of `update`."""
+        ...
+
+    def init(self, key: Array) -> State:
+        """Networks, targets and optimiser of a new learner."""
+        ...
+
+    def begin(self, state: State, key: Array) -> Memory:
+        """What acting remembers within one episode, made anew at its start."""
+        ...
+
+    def act(
+        self, state: State, memory: Memory, observation: Array, key: Array
+    ) -> tuple[Array, Memory]:
+        """Exploring action (A,) in [-1, 1] for one observation (O,)."""
+        ...
+
+    def update(self, state: State, batch: Batch, key: Array) -> Update:
+        """One cycle of U updates."""
+        ...
+
+    def policy(self, state: State) -> Actors:
+        """What acts without noise, as plain arrays for the policy file."""
+        ...

@@ -1,0 +1,55 @@
+"""The table of algorithms: a new one is one file and one line here."""
+
+from collections.abc import Callable
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
+
+from pacesetter.errors import UsageError, unknown
+
+
+class Entry(NamedTuple):
+    """Where an algorithm is and one line of what it is."""
+
+    target: str
+    help: str
+
+
+TABLE = {
+    "td3": Entry("pacesetter.algorithms.td3", "twin delayed DDPG (Fujimoto et al. 2018)"),
+    "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
+}
+
+
+class Kind(NamedTuple):
+    """An algorithm before it knows its task: its settings class and `build(spec, hyper)`."""
+
+    Hyper: type
+    build: Callable[..., Any]
+
+
+def plugins() -> dict[str, str]:
+    """Algorithms that other installed packages declare under `pacesetter.algorithms`."""
+    return {point.name: point.value for point in entry_points(group="pacesetter.algorithms")}
+
+
+def names() -> list[str]:
+    """All names that `find` knows."""
+    return [*TABLE, *plugins()]
+
+
+def find(name: str) -> Kind:
+    """The algorithm by name, or by `package.module:Class` with a class attribute `Hyper`."""
+    found = {key: entry.target for key, entry in TABLE.items()} | plugins()
+    target = name if ":" in name else found.get(name)
+    if target is None:
+        raise unknown("algorithm", name, found)
+    path, _, attribute = target.partition(":")
+    try:
+        module: Any = import_module(path)
+        if not attribute:
+            return Kind(module.Hyper, module.build)
+        found_class = getattr(module, attribute)
+        return Kind(found_class.Hyper, found_class)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"algorithm: cannot load '{target}': {error}") from None

@@ -1,0 +1,184 @@
+"""What to train and how: typed settings, merged from many places, checked once."""
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.dataclasses import dataclass
+
+from pacesetter import algorithms
+from pacesetter.errors import UsageError, unknown
+
+Settings = dict[str, Any]
+STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+_MULTIPLES = {"": 1, "k": 1_000, "m": 1_000_000}
+_SECONDS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
+
+
+def _count(value: object) -> object:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?(?:e\d+)?)([km]?)", str(value).strip().lower())
+    if found is None:
+        raise ValueError("is not a count; write 5000, 300k, 1M or 1e6")
+    number = float(found[1]) * _MULTIPLES[found[2]]
+    if number != int(number):
+        raise ValueError("is not a whole number")
+    return int(number)
+
+
+def _duration(value: object) -> object:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", str(value).strip().lower())
+    if value is not None and found is None:
+        raise ValueError("is not a length of time; write 90s, 5m or 2h")
+    return value if found is None else float(found[1]) * _SECONDS[found[2]]
+
+
+Count = Annotated[int, BeforeValidator(_count)]
+Duration = Annotated[float, BeforeValidator(_duration)]
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Hyper:
+    """Settings that every algorithm has; each algorithm's own `Hyper` adds to them."""
+
+    gamma: float = Field(0.99, ge=0, le=1, description="discount a step")
+    normalize_observation: bool = Field(False, description="running mean and deviation, cut at 10")
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class OffPolicy(Hyper):
+    """Settings of every algorithm that learns from a replay."""
+
+    batch_size: int = Field(256, ge=1, description="transitions in a minibatch")
+    replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
+    warmup: Count = Field(25_000, ge=0, description="first steps of all members, uniform actions")
+    updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
+    update_at: Literal["step", "episode"] = Field(
+        "step", description="as they fall due, or all at the episode's end"
+    )
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Run:
+    """What to train: the task, the budget, the members and how the best one is chosen."""
+
+    algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
+    env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
+    env_kwargs: dict[str, Any] = Field(default_factory=dict, description="given to gymnasium.make")
+    name: str = Field(pattern=r"^[\w.-]+$", description="folder of the run below its env")
+    steps: Count = Field(1_000_000, ge=1, description="env steps of all members together")
+    time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
+    seed: int = Field(0, ge=0, description="every random stream follows from it")
+    members: int = Field(1, ge=1, le=1000, description="learners that share the replay")
+    rule: Literal["none", "best", "random", "top_half", "tournament"] = Field(
+        "best", description="which member the others start again from"
+    )
+    select_on: Literal["train", "eval"] = Field(
+        "train", description="returns of training episodes, or of extra noise-free ones (counted)"
+    )
+    select_every: Count = Field(5_000, ge=1, description="steps between selections on eval")
+    select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
+    copy: Literal["full", "weights", "actor"] = Field(
+        "full", description="networks and optimiser, networks alone, or the actor alone"
+    )
+    same_init: bool = Field(False, description="members start from the same weights")
+    count: Literal["all", "member"] = Field(
+        "all", description="budget and clocks count all members' steps, or each member's own"
+    )
+    wait: bool = Field(True, description="a member whose episode ended waits for the others")
+    replay_scope: Literal["shared", "member"] = Field(
+        "shared", description="one replay or one each"
+    )
+    eval_every: Count = Field(5_000, ge=1, description="steps between evaluations")
+    eval_episodes: int = Field(10, ge=1, description="episodes of an evaluation")
+    checkpoint_every: Duration = Field(60.0, gt=0, description="time between checkpoints")
+    device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
+
+
+class Config(NamedTuple):
+    """A whole run: what to train and with which settings."""
+
+    run: Run
+    hyper: Any
+
+    def settings(self) -> Settings:
+        """All settings as one flat table, which `settle` takes back."""
+        return asdict(self.run) | asdict(self.hyper)
+
+
+def presets() -> dict[str, Settings]:
+    """The shipped presets by name."""
+    return tomllib.loads(Path(__file__).with_name("presets.toml").read_text())
+
+
+def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
+    """The algorithm behind a name and the settings that its presets lay over the defaults."""
+    known = presets()
+    if name in known:
+        table = dict(known[name])
+        by_env: dict[str, Settings] = table.pop("env", {})
+        base, layers = preset_layers(table.pop("algorithm"), env)
+        shared = {key: value for key, value in table.items() if key not in ("help", "source")}
+        return base, [*layers, shared, *(t for p, t in by_env.items() if fnmatchcase(env, p))]
+    if name.startswith("multi-") and name[6:] in {*algorithms.names(), *known}:
+        base, layers = preset_layers(name.removeprefix("multi-"), env)
+        return base, [*layers, {"members": 2, "rule": "best"}]
+    if name not in algorithms.names() and ":" not in name:
+        multi = [f"multi-{base}" for base in algorithms.names()]
+        raise unknown("algorithm", name, {*algorithms.names(), *known, *multi})
+    return name, []
+
+
+def read_file(path: Path) -> Settings:
+    """Settings from a TOML or JSON file, such as a finished run's config.json."""
+    import json
+
+    try:
+        text = path.read_text()
+        table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"config: cannot read {path}: {error}") from None
+    if not isinstance(table, dict):
+        raise UsageError(f"config: {path} holds no table of settings")
+    found: Settings = table.get("settings", table)
+    return {key.replace("-", "_"): value for key, value in found.items()}
+
+
+def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
+    """Merge defaults, presets and the given layers (later ones win) and check the result once."""
+    base, below = preset_layers(name, env)
+    hyper_type = algorithms.find(base).Hyper
+    merged: Settings = {"name": name.replace(":", "-")}
+    for layer in (*below, *layers):
+        merged |= layer
+    merged |= {"algorithm": base, "env": env}
+    run_names, hyper_names = names_of(Run), names_of(hyper_type)
+    for key in merged:
+        if key not in run_names | hyper_names:
+            raise unknown("setting", key, run_names | hyper_names)
+    run = build(Run, {key: value for key, value in merged.items() if key in run_names})
+    hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
+    return Config(run, hyper)
+
+
+def names_of(kind: type) -> set[str]:
+    """Field names of a settings class."""
+    return {field.name for field in fields(kind)}
+
+
+def build(kind: type, table: Settings) -> Any:
+    """Make checked settings, or refuse them in one line that names the field."""
+    try:
+        return kind(**table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"][:1])
+        if first["type"] == "literal_error":
+            options = re.findall(r"'([^']*)'", first.get("ctx", {})["expected"])
+            raise unknown(field, str(first["input"]), options) from None
+        message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+        raise UsageError(f"{field}: {message}, got {first['input']!r}") from None

@@ -1,0 +1,226 @@
+"""The env border: Gymnasium tasks in float32 and [-1, 1], checked, and entered again where left."""
+
+import difflib
+import logging
+import re
+import warnings
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+
+from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.policy import Floats, to_env
+from pacesetter.seeding import Stream, episode_seed
+
+
+class PaddedAnt(gymnasium.ObservationWrapper[Any, Any, Any]):
+    """Ant as the -v2 papers had it: 27 numbers and 84 contact forces that were always zero."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = Box(-np.inf, np.inf, (111,), np.float64)
+
+    def observation(self, observation: Any) -> Any:
+        return np.concatenate([observation, np.zeros(84)])
+
+
+def make_ant111(**kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """Entry point of `pacesetter/Ant111-v4`."""
+    return PaddedAnt(make_quietly("Ant-v4", kwargs).unwrapped)
+
+
+gymnasium.register(
+    "pacesetter/Ant111-v4",
+    entry_point="pacesetter.envs:make_ant111",
+    max_episode_steps=1000,
+)
+
+
+class Step(NamedTuple):
+    """What one env step gave; `terminated` ends the task, `truncated` only the episode."""
+
+    observation: Floats
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+    @property
+    def ended(self) -> bool:
+        return self.terminated or self.truncated
+
+
+class Snapshot(NamedTuple):
+    """Where an episode is: its number, its actions so far (T, A), the last observation (O,)."""
+
+    episode: int
+    actions: Floats
+    observation: Floats
+
+
+def known() -> list[str]:
+    """Ids that `make` accepts without a module, newest Gymnasium ones only."""
+    gone = re.compile(r"-v[0-3]$")
+    return [
+        name
+        for name, spec in gymnasium.registry.items()
+        if not (str(spec.entry_point).startswith("gymnasium.envs.mujoco") and gone.search(name))
+    ]
+
+
+def _log_warning(message: str) -> None:
+    if "settotalmass" not in message:  # Gymnasium's own models; nothing a user can do
+        logging.getLogger(__name__).warning("MuJoCo: %s", message)
+
+
+def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    """gymnasium.make without the notes that v4 is old and that its models use an old keyword."""
+    import mujoco
+
+    # Without a handler MuJoCo writes MUJOCO_LOG.TXT into the working directory.
+    mujoco.set_mju_user_warning(_log_warning)  # pyright: ignore[reportAttributeAccessIssue]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*The environment .* is out of date.*")
+        return gymnasium.make(name, disable_env_checker=True, **kwargs)
+
+
+def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
+    """A task by its Gymnasium id, or one line that says what is wrong with the id or the task."""
+    plain = name.split(":")[-1]
+    if not re.search(r"-v\d+$", plain):
+        versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
+        hint = f"; write {' or '.join(versions)}" if versions else "; such as HalfCheetah-v5"
+        raise UsageError(f"env: '{name}' has no version{hint}")
+    if ":" not in name and name not in known():
+        raise unknown("env", name, _near(name))
+    try:
+        env = make_quietly(name, kwargs or {})
+    except Exception as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise UsageError(f"env: cannot make '{name}': {reason}") from None
+    _check_space(f"env: {name}: observation space", env.observation_space)
+    _check_space(f"env: {name}: action space", env.action_space)
+    if not np.isfinite(np.concatenate(_bounds(env))).all():
+        raise UsageError(
+            f"env: {name}: action space: its bounds must be finite, it is {env.action_space}"
+        )
+    return env
+
+
+def _near(name: str) -> list[str]:
+    return difflib.get_close_matches(name, known(), n=3, cutoff=0.4) or known()
+
+
+def _check_space(what: str, space: Any) -> None:
+    if not isinstance(space, Box):
+        hint = " (wrap it in FlattenObservation)" if "observation" in what else ""
+        raise UsageError(f"{what}: must be a Box, it is {type(space).__name__}{hint}")
+
+
+def _bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:
+    space: Any = env.action_space
+    return space.low.astype(np.float32).ravel(), space.high.astype(np.float32).ravel()
+
+
+class Environment:
+    """One env and the episode it is in.
+
+    Every episode's reset is seeded by its number, so an episode is found again by its number and
+    its actions, without knowing the simulator.
+    """
+
+    def __init__(
+        self, name: str, kwargs: dict[str, Any], seed: int, stream: Stream, index: int = 0
+    ) -> None:
+        self.env = make(name, kwargs)
+        self.name, self.seed, self.stream, self.index = name, seed, stream, index
+        space: Any = self.env.action_space
+        self.low, self.high = _bounds(self.env)
+        self.action_shape, self.action_type = space.shape, space.dtype
+        self.observation_shape = self.env.observation_space.shape
+        self.observation_size = int(np.prod(self.observation_shape or ()))
+        self.action_size = len(self.low)
+        self.episode = -1
+        self.actions: list[Floats] = []
+        self.observation = np.zeros(self.observation_size, np.float32)
+
+    def reset(self, episode: int | None = None) -> Floats:
+        """Enter an episode by its number, by default the next one."""
+        self.episode = self.episode + 1 if episode is None else episode
+        self.actions = []
+        seed = episode_seed(self.seed, self.stream, self.index, self.episode)
+        result: Any = self.env.reset(seed=seed)
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise self._broken("reset", "must return (observation, info)")
+        self.observation = self._observation(result[0])
+        return self.observation
+
+    def step(self, action: Floats) -> Step:
+        """One step with an action (A,) in [-1, 1]."""
+        self.actions.append(action)
+        scaled = to_env(action, self.low, self.high)
+        result: Any = self.env.step(scaled.reshape(self.action_shape).astype(self.action_type))
+        if not (isinstance(result, tuple) and len(result) == 5):
+            raise self._broken(
+                "step", "must return (observation, reward, terminated, truncated, info)"
+            )
+        observation, reward, terminated, truncated, info = result
+        if np.ndim(reward) != 0 or not isinstance(reward, (int, float, np.number)):
+            raise self._broken("reward", f"must be one number, it is {reward!r}")
+        if not np.isfinite(reward):
+            raise self._broken("reward", f"must be finite, it is {reward}")
+        for what, flag in (("terminated", terminated), ("truncated", truncated)):
+            if not isinstance(flag, (bool, np.bool_)):
+                raise self._broken(what, f"must be a bool, it is {flag!r}")
+        self.observation = self._observation(observation)
+        return Step(self.observation, float(reward), bool(terminated), bool(truncated), info)
+
+    def check(self) -> None:
+        """Refuse an env that breaks the API, before anything is written."""
+        try:
+            self.reset(0)
+            self.step(np.zeros(self.action_size, np.float32))
+        except TrainingError as error:
+            raise UsageError(f"env: {error}") from None
+        except Exception as error:
+            raise UsageError(f"env: {self.name}: fails at its first step: {error}") from None
+        self.episode = -1
+
+    def snapshot(self) -> Snapshot:
+        """Where the running episode is."""
+        shape = (len(self.actions), self.action_size)
+        actions = np.array(self.actions, np.float32).reshape(shape)
+        return Snapshot(self.episode, actions, self.observation)
+
+    def restore(self, snapshot: Snapshot) -> bool:
+        """Enter the snapshot's episode again; False if the env does not repeat it exactly."""
+        self.reset(snapshot.episode)
+        for action in snapshot.actions:
+            if self.step(action).ended:
+                break
+        return np.array_equal(self.observation, snapshot.observation) and len(self.actions) == len(
+            snapshot.actions
+        )
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _observation(self, observation: Any) -> Floats:
+        try:
+            flat = np.array(observation, np.float32).ravel()
+        except (TypeError, ValueError):
+            raise self._broken("observation", f"must be numbers, it is {observation!r}") from None
+        if np.shape(observation) != self.observation_shape:
+            shape = np.shape(observation)
+            raise self._broken(
+                "observation", f"must have shape {self.observation_shape}, has {shape}"
+            )
+        if not np.isfinite(flat).all():
+            where = int(np.flatnonzero(~np.isfinite(flat))[0])
+            raise self._broken("observation", f"must be finite, number {where} is {flat[where]}")
+        return flat
+
+    def _broken(self, what: str, why: str) -> TrainingError:
+        return TrainingError(f"{self.name}: {what}: {why}")

@@ -1,0 +1,25 @@
+"""What can go wrong, said to people in one line: the field, the fault, what is allowed."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class UsageError(Exception):
+    """Bad input: an unknown name, a value out of range, a damaged file. Exit code 2."""
+
+
+class TrainingError(Exception):
+    """A run that cannot go on, such as one with a NaN; its last good checkpoint is kept."""
+
+
+def unknown(kind: str, word: str, options: Iterable[str]) -> UsageError:
+    """Refuse an unknown name, with the nearest ones that exist."""
+    options = sorted(options)
+    near = get_close_matches(word, options, n=3, cutoff=0.6)
+    if near:
+        hint = f"did you mean {' or '.join(near)}?"
+    elif len(options) <= 12:
+        hint = f"allowed: {', '.join(options)}"
+    else:
+        hint = f"{len(options)} are known; see `pacesetter list`"
+    return UsageError(f"{kind}: unknown '{word}'; {hint}")

@@ -1,0 +1,106 @@
+"""Seeded rollouts of any policy, on envs and start states that training never sees."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from pacesetter.envs import Environment
+from pacesetter.errors import UsageError
+from pacesetter.policy import Floats, Policy
+from pacesetter.seeding import Stream, generator
+
+Act = Callable[[Floats], Floats]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Undiscounted returns and lengths of complete episodes, and the mean reward terms of one."""
+
+    returns: list[float]
+    lengths: list[int]
+    mean: float
+    std: float
+    terms: dict[str, float]
+
+    def table(self) -> dict[str, Any]:
+        """As plain JSON."""
+        return asdict(self)
+
+
+def rollouts(
+    act: Act, env: Environment, episodes: int, first: int = 0, limit: float = inf
+) -> Evaluation:
+    """Run episodes `first`, `first + 1`, ... with actions in [-1, 1]; std is over episodes, ddof 0.
+
+    After `limit` steps in all, the rest is cut.
+    """
+    returns: list[float] = []
+    lengths: list[int] = []
+    terms: dict[str, float] = {}
+    for episode in range(first, first + episodes):
+        observation, total, length, ended = env.reset(episode), 0.0, 0, False
+        while not ended and sum(lengths) + length < limit:
+            step = env.step(act(observation))
+            observation, ended = step.observation, step.ended
+            total += step.reward
+            length += 1
+            for name, value in step.info.items():
+                if name.startswith("reward_") and np.ndim(value) == 0:
+                    terms[name] = terms.get(name, 0.0) + float(value) / episodes
+        returns.append(total)
+        lengths.append(length)
+    return Evaluation(returns, lengths, float(np.mean(returns)), float(np.std(returns)), terms)
+
+
+def evaluate(
+    policy: Policy | None,
+    env: str | None = None,
+    episodes: int = 10,
+    seed: int = 0,
+    *,
+    noise: float = 0.0,
+    env_kwargs: dict[str, Any] | None = None,
+) -> Evaluation:
+    """Evaluate a policy on fresh episodes; without one, uniformly random actions.
+
+    The env defaults to the policy's own; `noise` is the deviation of Gaussian noise in [-1, 1].
+    """
+    if episodes < 1:
+        raise UsageError(f"episodes: must be at least 1, got {episodes}")
+    about = policy.about if policy else {}
+    name = env or about.get("env")
+    if name is None:
+        raise UsageError("env: none given and the policy names none")
+    if env is None and ":" in name:
+        raise UsageError(
+            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
+        )
+    kwargs = about.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
+    world = Environment(name, kwargs, seed, Stream.REPORT)
+    world.check()
+    try:
+        return rollouts(_acting(policy, world, noise, seed), world, episodes)
+    finally:
+        world.close()
+
+
+def _acting(policy: Policy | None, env: Environment, noise: float, seed: int) -> Act:
+    rng = generator(seed, Stream.REPORT)
+    size = env.action_size
+    if policy is None:
+        return lambda observation: rng.uniform(-1, 1, size).astype(np.float32)
+    if (taken := policy.actors[0][0]["kernel"].shape[0]) != env.observation_size or len(
+        policy.low
+    ) != size:
+        raise UsageError(
+            f"env: {env.name} has observations of {env.observation_size} and actions of {size}; "
+            f"the policy takes {taken} and gives {len(policy.low)}"
+        )
+    if noise == 0:
+        return policy.act
+    return lambda observation: (policy.act(observation) + noise * rng.normal(size=size)).astype(
+        np.float32
+    )

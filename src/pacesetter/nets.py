@@ -1,0 +1,73 @@
+"""Multi-layer perceptrons as plain pytrees: a tuple of layers, each a dict of arrays."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+Array = jax.Array
+Layer = dict[str, Array]
+Network = tuple[Layer, ...]
+NORM_EPSILON = 1e-5
+
+
+def dense(key: Array, fan_in: int, fan_out: int, bound: float | None = None) -> Layer:
+    """Weights and bias uniform in +-bound, by default 1/sqrt(fan_in) as PyTorch's Linear."""
+    limit = fan_in**-0.5 if bound is None else bound
+    kernel_key, bias_key = jax.random.split(key)
+    return {
+        "kernel": jax.random.uniform(kernel_key, (fan_in, fan_out), minval=-limit, maxval=limit),
+        "bias": jax.random.uniform(bias_key, (fan_out,), minval=-limit, maxval=limit),
+    }
+
+
+def init(
+    key: Array,
+    inputs: int,
+    hidden: Sequence[int],
+    outputs: int,
+    *,
+    layer_norm: bool = False,
+    output_bound: float | None = None,
+    joins: tuple[int, int] | None = None,
+) -> Network:
+    """A new network; `joins=(layer, size)` widens that layer's input, for a late action."""
+    sizes = [inputs, *hidden, outputs]
+    extra = dict([joins] if joins else [])
+    layers: list[Layer] = []
+    for index, layer_key in enumerate(jax.random.split(key, len(sizes) - 1)):
+        is_output = index == len(hidden)
+        fan_in = sizes[index] + extra.get(index, 0)
+        layer = dense(layer_key, fan_in, sizes[index + 1], output_bound if is_output else None)
+        if layer_norm and not is_output:
+            layer |= {"scale": jnp.ones(sizes[index + 1]), "offset": jnp.zeros(sizes[index + 1])}
+        layers.append(layer)
+    return tuple(layers)
+
+
+def hidden_layer(layer: Layer, x: Array, activation: Callable[[Array], Array]) -> Array:
+    """One hidden layer: affine, layer norm if it has one, activation."""
+    x = x @ layer["kernel"] + layer["bias"]
+    if "scale" in layer:
+        x = jax.nn.standardize(x, epsilon=NORM_EPSILON) * layer["scale"] + layer["offset"]
+    return activation(x)
+
+
+def apply(network: Network, x: Array, activation: Callable[[Array], Array] = jax.nn.relu) -> Array:
+    """The network's linear output (..., outputs) for inputs (..., inputs)."""
+    for layer in network[:-1]:
+        x = hidden_layer(layer, x, activation)
+    return x @ network[-1]["kernel"] + network[-1]["bias"]
+
+
+def actor(network: Network, observation: Array) -> Array:
+    """Deterministic action (..., A) in [-1, 1]."""
+    return jnp.tanh(apply(network, observation))
+
+
+def critic(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
+    """Value (...) of an action, which joins the observation's features at `action_layer`."""
+    x = observation
+    for layer in network[:action_layer]:
+        x = hidden_layer(layer, x, jax.nn.relu)
+    return apply(network[action_layer:], jnp.concatenate([x, action], axis=-1))[..., 0]

@@ -1,0 +1,161 @@
+"""A trained policy as one small file, and what it does in NumPy alone: no JAX, no training code."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pacesetter import storage
+from pacesetter.errors import UsageError
+
+Floats = NDArray[np.float32]
+Layers = list[dict[str, Floats]]
+KIND = "policy"
+SCHEMA = 1
+NORM_EPSILON = np.float32(1e-5)
+OBSERVATION_LIMIT = 10.0
+
+
+def _relu(x: Floats) -> Floats:
+    return np.maximum(x, np.float32(0))
+
+
+def _clip(x: Floats) -> Floats:
+    return np.clip(x, np.float32(-1), np.float32(1))
+
+
+ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"relu": _relu, "tanh": np.tanh}
+OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": _clip}
+
+
+class Actors(NamedTuple):
+    """What an algorithm gives to be written: layers with a leading axis N of averaged actors."""
+
+    layers: Any
+    activation: str
+    output: str
+
+
+def to_env(action: Floats, low: Floats, high: Floats) -> Floats:
+    """Clip an action to [-1, 1] and scale it to the env's own bounds; nowhere else is this done."""
+    scaled = low + (high - low) * (_clip(action) + np.float32(1)) / np.float32(2)
+    return np.clip(scaled, low, high).astype(np.float32)
+
+
+def normalize(observation: Floats, mean: Floats, deviation: Floats) -> Floats:
+    """Subtract, divide and cut at +-10, as the learners saw it."""
+    scaled = (observation - mean) / deviation
+    return np.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Maps an observation (O,) or a batch (B, O) to actions in the env's own units.
+
+    `about` says where it comes from: env, env_kwargs, algorithm, step, score, versions.
+    """
+
+    actors: list[Layers]
+    activation: str
+    output: str
+    low: Floats
+    high: Floats
+    normalizer: tuple[Floats, Floats] | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self, observation: Any) -> Floats:
+        """Action in the env's units, clipped to its bounds."""
+        return to_env(self.act(observation), self.low, self.high)
+
+    def act(self, observation: Any) -> Floats:
+        """Action in [-1, 1], the mean over the actors."""
+        x = np.asarray(observation, np.float32)
+        size = self.actors[0][0]["kernel"].shape[0]
+        if x.shape[-1:] != (size,):
+            raise UsageError(f"observation: shape {x.shape} given; this policy takes (..., {size})")
+        if self.normalizer is not None:
+            x = normalize(x, *self.normalizer)
+        actions = [self._forward(layers, x) for layers in self.actors]
+        return actions[0] if len(actions) == 1 else np.asarray(np.mean(actions, axis=0))
+
+    def _forward(self, layers: Layers, x: Floats) -> Floats:
+        activation = ACTIVATIONS[self.activation]
+        for layer in layers[:-1]:
+            x = x @ layer["kernel"] + layer["bias"]
+            if "scale" in layer:
+                centred = x - x.mean(axis=-1, keepdims=True)
+                variance = (centred**2).mean(axis=-1, keepdims=True)
+                x = centred / np.sqrt(variance + NORM_EPSILON) * layer["scale"] + layer["offset"]
+            x = activation(x)
+        return OUTPUTS[self.output](x @ layers[-1]["kernel"] + layers[-1]["bias"])
+
+    def save(self, path: str | Path) -> None:
+        """Write the policy file; it holds all that acting needs."""
+        arrays = {
+            f"actors.{n}.{i}.{name}": array
+            for n, layers in enumerate(self.actors)
+            for i, layer in enumerate(layers)
+            for name, array in layer.items()
+        }
+        arrays |= {"low": self.low, "high": self.high}
+        if self.normalizer is not None:
+            arrays |= {"mean": self.normalizer[0], "deviation": self.normalizer[1]}
+        table = {"schema": SCHEMA, "activation": self.activation, "output": self.output}
+        storage.write(Path(path), KIND, storage.Content(arrays, table | {"about": self.about}))
+
+
+def unstack(actors: Actors) -> list[Layers]:
+    """Plain NumPy layers of each actor, copied out of whatever holds them."""
+    count = np.asarray(actors.layers[0]["kernel"]).shape[0]
+    return [
+        [
+            {name: np.array(value[n], np.float32) for name, value in layer.items()}
+            for layer in actors.layers
+        ]
+        for n in range(count)
+    ]
+
+
+def load(path: str | Path) -> Policy:
+    """The policy of a policy file; nothing in the file is executed or imported."""
+    path = Path(path)
+    arrays, table = storage.read(path, KIND)
+    if table.get("schema") != SCHEMA:
+        raise UsageError(
+            f"{path}: policy schema {table.get('schema')}; this version reads {SCHEMA}"
+        )
+    try:
+        policy = Policy(
+            actors=_actors(arrays),
+            activation=_one_of(table["activation"], ACTIVATIONS),
+            output=_one_of(table["output"], OUTPUTS),
+            low=arrays["low"],
+            high=arrays["high"],
+            normalizer=(arrays["mean"], arrays["deviation"]) if "mean" in arrays else None,
+            about=dict(table["about"]),
+        )
+        if not all(np.isfinite(array).all() for array in arrays.values()):
+            raise ValueError("holds a number that is not finite")
+        if policy.act(np.zeros(policy.actors[0][0]["kernel"].shape[0])).shape != policy.low.shape:
+            raise ValueError("its last layer does not fit its bounds")
+    except (KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+        raise UsageError(f"{path}: damaged policy: {error}") from None
+    return policy
+
+
+def _one_of(word: str, options: Any) -> str:
+    if word not in options:
+        raise ValueError(f"'{word}' is none of {', '.join(options)}")
+    return word
+
+
+def _actors(arrays: storage.Arrays) -> list[Layers]:
+    actors: dict[int, dict[int, dict[str, Floats]]] = {}
+    for key, array in arrays.items():
+        if key.startswith("actors."):
+            _, n, i, name = key.split(".")
+            actors.setdefault(int(n), {}).setdefault(int(i), {})[name] = array
+    return [[actors[n][i] for i in range(len(actors[n]))] for n in range(len(actors))]

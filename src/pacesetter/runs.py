@@ -1,0 +1,206 @@
+"""The run directory: what is where, its config, its log, its lock, and how to find one."""
+
+import fcntl
+import json
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pacesetter.config import Config, settle
+from pacesetter.errors import UsageError
+from pacesetter.storage import TEMPORARY, write_atomically
+
+SCHEMA = 1
+PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
+Row = dict[str, Any]
+
+
+class RunDirectory:
+    """One run's folder, held by at most one process at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config_file = path / "config.json"
+        self.metrics_file = path / "metrics.jsonl"
+        self.policy_file = path / "policy.safetensors"
+        self.best_file = path / "best.safetensors"
+        self.state_file = path / "last" / "state.safetensors"
+        self.previous_file = path / "last" / "previous.safetensors"
+        self._lock: int | None = None
+
+    @classmethod
+    def of(cls, runs: str | Path, config: Config) -> "RunDirectory":
+        """Where a run's settings place it: runs / env / name / seed."""
+        run = config.run
+        return cls(Path(runs) / re.sub(r"[/:]", "-", run.env) / run.name / str(run.seed))
+
+    def refuse_existing(self, config: Config) -> None:
+        """Refuse to train onto a run that is there, and say how to go on instead."""
+        if not self.config_file.exists():
+            return
+        old, new = self.settings(), json.loads(json.dumps(config.settings()))
+        differing = [key for key in new if old.get(key) != new[key]]
+        if not differing:
+            raise UsageError(f"run: {self.path} exists; go on with `pacesetter resume {self.path}`")
+        key = differing[0]
+        raise UsageError(
+            f"run: {self.path} exists with {key}={old.get(key)}, not {new[key]}; give this one "
+            f"another --name, or go on with `pacesetter resume {self.path}`"
+        )
+
+    def create(self, config: Config) -> None:
+        """Make the folder and write its config; the only step that starts a run on disk."""
+        try:
+            self.state_file.parent.mkdir(parents=True, exist_ok=True)
+            self.lock()
+            self.write_config(config)
+        except OSError as error:
+            raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
+
+    def write_config(self, config: Config) -> None:
+        """Write settings, command line, versions, commit and thread count."""
+        table = {"schema": SCHEMA, "settings": config.settings(), **provenance()}
+        write_atomically(self.config_file, (json.dumps(table, indent=1) + "\n").encode())
+
+    def record(self) -> Row:
+        """The whole config.json."""
+        try:
+            table = json.loads(self.config_file.read_text())
+            if table["schema"] != SCHEMA or not isinstance(table["settings"], dict):
+                raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
+        except FileNotFoundError:
+            raise UsageError(f"run: {self.path} holds no run (no config.json)") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UsageError(f"{self.config_file}: damaged or foreign: {error}") from None
+        return table
+
+    def settings(self) -> Row:
+        """The run's flat settings."""
+        return self.record()["settings"]
+
+    def config(self) -> Config:
+        """The run's checked settings."""
+        settings = self.settings()
+        try:
+            return settle(settings["algorithm"], settings["env"], settings)
+        except KeyError as error:
+            raise UsageError(f"{self.config_file}: damaged: {error} is missing") from None
+
+    def rows(self) -> list[Row]:
+        """All complete lines of the log."""
+        if not self.metrics_file.exists():
+            return []
+        lines = self.metrics_file.read_text().split("\n")[:-1]
+        try:
+            return [json.loads(line) for line in lines]
+        except ValueError as error:
+            raise UsageError(f"{self.metrics_file}: damaged: {error}") from None
+
+    def append(self, row: Row) -> None:
+        """Add one line to the log."""
+        with self.metrics_file.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def log_size(self) -> int:
+        """Bytes of the log."""
+        return self.metrics_file.stat().st_size if self.metrics_file.exists() else 0
+
+    def cut_log(self, size: int) -> None:
+        """Cut the log back to what a checkpoint covers."""
+        if self.log_size() < size:
+            raise UsageError(f"{self.metrics_file}: damaged: shorter than its checkpoint says")
+        if self.metrics_file.exists():
+            os.truncate(self.metrics_file, size)
+
+    def sweep(self) -> None:
+        """Remove what a killed write left behind."""
+        for folder in (self.path, self.state_file.parent):
+            for leftover in folder.glob(f"*{TEMPORARY}"):
+                leftover.unlink()
+
+    def lock(self) -> None:
+        """Hold the folder until `unlock` or the process ends; refuse a second holder."""
+        file = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            holder = os.read(file, 200).decode(errors="replace").strip()
+            os.close(file)
+            raise UsageError(
+                f"run: {self.path} is in use by {holder or 'another process'}"
+            ) from None
+        os.truncate(file, 0)
+        os.write(file, f"process {os.getpid()} on {platform.node()}\n".encode())
+        self._lock = file
+
+    def unlock(self) -> None:
+        """Let another process have the folder."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def in_use(self) -> bool:
+        """Whether a process holds the folder now."""
+        try:
+            with (self.path / "lock").open() as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+        return False
+
+
+def provenance() -> Row:
+    """What a result needs to be repeated: command, versions, commit, machine, thread count."""
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "versions": {name: version(name) for name in PACKAGES}
+        | {"python": platform.python_version()},
+        "commit": _commit(),
+        "threads": threads(),
+        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
+    }
+
+
+def _commit() -> str | None:
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists() or not (git := shutil.which("git")):
+        return None
+    describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or None
+
+
+def threads() -> int:
+    """Size of XLA's thread pool, which decides result bits on a CPU."""
+    return int(os.environ.get("NPROC") or len(os.sched_getaffinity(0)))
+
+
+def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
+    """All runs below a folder, in order."""
+    for config in sorted(Path(runs).rglob("config.json")):
+        yield RunDirectory(config.parent)
+
+
+def find(name: str, runs: str | Path = "runs") -> RunDirectory:
+    """A run by its path, or by any tail of it that only one run has."""
+    if (Path(name) / "config.json").exists():
+        return RunDirectory(Path(name))
+    parts = Path(name).parts
+    found = [run for run in find_all(runs) if run.path.parts[-len(parts) :] == parts]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UsageError(f"run: '{name}' fits {', '.join(str(run.path) for run in found[:4])}")
+    known = [str(run.path) for run in find_all(runs)]
+    near = f"; there are {', '.join(known[:4])}" if known else f"; none is below {runs}"
+    raise UsageError(f"run: '{name}' not found{near}")

@@ -1,0 +1,32 @@
+"""Every random stream of a run, derived from its one seed, so that no stream shifts another."""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """What a stream is for. New ones go at the end: the numbers decide every drawn bit."""
+
+    TRAIN = 0
+    SELECT = 1
+    EVALUATE = 2
+    REPORT = 3
+    WARMUP = 4
+    SAMPLE = 5
+    RULE = 6
+
+
+def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
+    """NumPy generator of one stream of one member."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, index)))
+
+
+def episode_seed(seed: int, stream: Stream, index: int, episode: int) -> int:
+    """Seed of one episode's `reset`; its low bits are the stream, so streams never share a start.
+
+    An episode that is seeded by its number can be entered again at any time, which is what makes
+    a resumed run exact.
+    """
+    sequence = np.random.SeedSequence(seed, spawn_key=(stream, index, episode))
+    return int(sequence.generate_state(1)[0]) << 3 | stream

@@ -1,0 +1,102 @@
+"""Files that survive a kill and a stranger: arrays and JSON in safetensors, hashed and atomic."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from pacesetter.errors import UsageError
+
+Arrays = dict[str, NDArray[Any]]
+TEMPORARY = ".tmp"
+
+
+class Content(NamedTuple):
+    """What a file holds: arrays by name and one JSON table."""
+
+    arrays: Arrays
+    table: dict[str, Any]
+
+
+def digest(array: NDArray[Any]) -> str:
+    """SHA-256 of an array's bytes in C order."""
+    return hashlib.sha256(np.ascontiguousarray(array).data).hexdigest()
+
+
+def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
+    """Replace a file so that a kill or a power cut leaves the old or the new one, never a part.
+
+    `keep` is where the replaced file stays reachable.
+    """
+    temporary = path.with_name(path.name + TEMPORARY)
+    with temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    if keep is not None and path.exists():
+        keep.unlink(missing_ok=True)
+        os.link(path, keep)
+    temporary.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def write(path: Path, kind: str, content: Content, keep: Path | None = None) -> None:
+    """Write arrays and table with the hash of each array."""
+    # safetensors 0.8 silently writes wrong bytes for transposed or sliced arrays.
+    arrays = {name: np.ascontiguousarray(array) for name, array in content.arrays.items()}
+    hashes = {name: digest(array) for name, array in arrays.items()}
+    table = json.dumps(content.table, sort_keys=True)
+    manifest = {
+        "kind": kind,
+        "table": table,
+        "hashes": json.dumps(hashes, sort_keys=True),
+        "table_hash": hashlib.sha256(table.encode()).hexdigest(),
+    }
+    write_atomically(path, save(arrays, metadata=manifest), keep)
+
+
+def read(path: Path, kind: str) -> Content:
+    """Read a file that `write` made, or refuse it in one line: foreign, damaged or missing."""
+    try:
+        data = path.read_bytes()
+        manifest = _manifest(data)
+        if manifest.get("kind") != kind:
+            raise UsageError(f"{path}: is no pacesetter {kind}")
+        arrays = load(data)
+        hashes: Mapping[str, str] = json.loads(manifest["hashes"])
+        damaged = [name for name in {*arrays, *hashes} if not _intact(name, arrays, hashes)]
+        if hashlib.sha256(manifest["table"].encode()).hexdigest() != manifest["table_hash"]:
+            damaged.append("its table")
+        if damaged:
+            raise UsageError(f"{path}: damaged: {', '.join(sorted(damaged)[:3])}")
+        return Content(arrays, json.loads(manifest["table"]))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such file") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UsageError(f"{path}: damaged or foreign: {reason}") from None
+
+
+def _manifest(data: bytes) -> dict[str, str]:
+    size = int.from_bytes(data[:8], "little")
+    if not 2 <= size <= len(data) - 8:
+        raise ValueError("its header is cut off")
+    header = json.loads(data[8 : 8 + size])
+    return header.get("__metadata__", {})
+
+
+def _intact(name: str, arrays: Arrays, hashes: Mapping[str, str]) -> bool:
+    return name in arrays and name in hashes and digest(arrays[name]) == hashes[name]

@@ -1,0 +1,137 @@
+"""A whole run to a file and back, bit for bit: learners, replay, envs, random streams, counters."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from pacesetter import storage
+from pacesetter.envs import Snapshot
+from pacesetter.errors import TrainingError, UsageError
+from pacesetter.runs import threads
+from pacesetter.storage import Arrays, Content
+from pacesetter.training.progress import Progress
+
+if TYPE_CHECKING:
+    from pacesetter.training.trainer import Trainer
+
+KIND = "checkpoint"
+SCHEMA = 1
+
+
+def save(trainer: "Trainer") -> None:
+    """Write the checkpoint; the one before it stays as previous.safetensors."""
+    arrays = {
+        **_flatten("states", trainer.states),
+        **_flatten("memory", trainer.memory),
+        "normalizer": trainer.normalizer.sums,
+    }
+    _refuse_faults(arrays, trainer.progress.step)
+    episodes: list[int] = []
+    for index, env in enumerate(trainer.envs):
+        snapshot = env.snapshot()
+        episodes.append(snapshot.episode)
+        arrays[f"env.{index}.actions"] = snapshot.actions
+        arrays[f"env.{index}.observation"] = snapshot.observation
+    table = {
+        "schema": SCHEMA,
+        "threads": threads(),
+        "progress": trainer.progress.table(),
+        "streams": [rng.bit_generator.state for rng in trainer.streams],
+        "episodes": episodes,
+        "replays": [replay.commit() for replay in trainer.replays],
+        "log": trainer.directory.log_size(),
+    }
+    directory = trainer.directory
+    storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
+
+
+def restore(trainer: "Trainer") -> list[str]:
+    """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
+    notes: list[str] = []
+    directory = trainer.directory
+    files = [directory.state_file, directory.previous_file]
+    for file in (file for file in files if file.exists()):
+        try:
+            _restore(trainer, file, notes)
+        except UsageError as error:
+            notes.append(f"{error}; trying the checkpoint before it")
+            continue
+        return notes
+    if notes:
+        raise UsageError(
+            f"{notes[0].split(';')[0]}; no whole checkpoint is left in {directory.path}"
+        )
+    return ["no checkpoint yet, starting from the beginning"]
+
+
+def _restore(trainer: "Trainer", file: Path, notes: list[str]) -> None:
+    arrays, table = storage.read(file, KIND)
+    if table.get("schema") != SCHEMA:
+        raise UsageError(
+            f"{file}: checkpoint schema {table.get('schema')}, this version reads {SCHEMA}"
+        )
+    try:
+        states = _rebuild("states", trainer.states, arrays)
+        memory = _rebuild("memory", trainer.memory, arrays)
+        for replay, part in zip(trainer.replays, table["replays"], strict=True):
+            replay.restore(part)
+        trainer.progress = Progress.load(table["progress"])
+        trainer.normalizer.sums = arrays["normalizer"]
+        for rng, state in zip(trainer.streams, table["streams"], strict=True):
+            rng.bit_generator.state = state
+        _enter_episodes(trainer, table["episodes"], arrays, notes)
+    except (KeyError, ValueError, TypeError) as error:
+        raise UsageError(f"{file}: does not fit this run: {error}") from None
+    trainer.states, trainer.memory = states, memory
+    trainer.directory.cut_log(int(table["log"]))
+    if table["threads"] != threads():
+        notes.append(
+            f"made with {table['threads']} threads, going on with {threads()}: "
+            "results will differ in their last bits"
+        )
+
+
+def _enter_episodes(
+    trainer: "Trainer", episodes: list[int], arrays: Arrays, notes: list[str]
+) -> None:
+    for index, (env, episode) in enumerate(zip(trainer.envs, episodes, strict=True)):
+        actions, observation = (
+            arrays[f"env.{index}.{part}"] for part in ("actions", "observation")
+        )
+        member = trainer.progress.members[index]
+        if member.starting:
+            env.episode = episode
+        elif not env.restore(Snapshot(episode, actions, observation)):
+            notes.append(
+                f"member {index}: {env.name} does not repeat an episode exactly; a new one starts"
+            )
+            member.starting, member.episode_return, member.episode_length = True, 0.0, 0
+
+
+def _flatten(prefix: str, tree: Any) -> Arrays:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {_name(prefix, path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def _rebuild(prefix: str, like: Any, arrays: Arrays) -> Any:
+    leaves, structure = jax.tree_util.tree_flatten_with_path(like)
+    found: list[Any] = []
+    for path, leaf in leaves:
+        array = arrays[_name(prefix, path)]
+        if array.shape != leaf.shape or array.dtype != leaf.dtype:
+            raise ValueError(f"{_name(prefix, path)} is {array.shape}, expected {leaf.shape}")
+        found.append(jax.numpy.array(array))
+    return jax.tree.unflatten(structure, found)
+
+
+def _name(prefix: str, path: Any) -> str:
+    return f"{prefix}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
+
+
+def _refuse_faults(arrays: Arrays, step: int) -> None:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            member = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise TrainingError(f"member {member}, step {step}: {name} is not finite")

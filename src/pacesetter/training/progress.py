@@ -1,0 +1,93 @@
+"""All counters of a run: plain numbers for the checkpoint and, as a ledger, for every row."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+TRAIN_ROW_EVERY = 1_000  # steps
+
+
+@dataclass
+class Member:
+    """One member's counters and the episode it is in."""
+
+    steps: int = 0
+    owed: float = 0.0  # critic updates that have fallen due
+    active: bool = True  # False while it waits for the others to end their episodes
+    starting: bool = True  # its next tick begins an episode
+    started: int = 0  # step of the run at which the episode began
+    episode_return: float = 0.0
+    episode_length: int = 0
+    window: list[float] = field(default_factory=list[float])  # returns since the last selection
+
+
+@dataclass
+class Progress:
+    """Where a run is."""
+
+    members: list[Member]
+    tick: int = 0
+    cycle: int = 0
+    selection_steps: int = 0
+    updates: int = 0
+    transitions: int = 0
+    episodes: int = 0
+    champion: int = 0
+    selections: int = 0
+    deviations: list[float] = field(default_factory=list[float])
+    next_evaluation: int = 0
+    last_evaluation: int = -1
+    next_selection: int = 0
+    next_train: int = TRAIN_ROW_EVERY
+    best: float | None = None
+    finished: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
+    losses: list[list[float]] = field(default_factory=list[list[float]])  # sum and count, a member
+    wall_seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    @classmethod
+    def of(cls, members: int) -> "Progress":
+        return cls([Member() for _ in range(members)])
+
+    @classmethod
+    def load(cls, table: dict[str, Any]) -> "Progress":
+        """The inverse of `asdict`."""
+        members: Any = [Member(**member) for member in table["members"]]
+        return cls(**(table | {"members": members}))
+
+    @property
+    def step(self) -> int:
+        """Env steps so far, of all members and of selection."""
+        return sum(member.steps for member in self.members) + self.selection_steps
+
+    def each(self) -> Iterator[tuple[int, Member]]:
+        return enumerate(self.members)
+
+    def table(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def ledger(self) -> dict[str, Any]:
+        """What the run has spent."""
+        return {
+            "member_steps": [member.steps for member in self.members],
+            "selection_steps": self.selection_steps,
+            "updates": self.updates,
+            "transitions": self.transitions,
+            "episodes": self.episodes,
+            "cpu_seconds": round(self.cpu_seconds, 3),
+            "wall_seconds": round(self.wall_seconds, 3),
+        }
+
+
+class Clock:
+    """Adds the time that passes to a progress; a resumed run goes on from its checkpoint's sums."""
+
+    def __init__(self) -> None:
+        self.last = (time.perf_counter(), time.process_time())
+
+    def tell(self, progress: Progress) -> None:
+        now = (time.perf_counter(), time.process_time())
+        progress.wall_seconds += now[0] - self.last[0]
+        progress.cpu_seconds += now[1] - self.last[1]
+        self.last = now
