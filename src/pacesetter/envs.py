@@ -61,13 +61,9 @@ class Snapshot(NamedTuple):
 
 
 def known() -> list[str]:
-    """Ids that `make` accepts without a module, newest Gymnasium ones only."""
-    gone = re.compile(r"-v[0-3]$")
-    return [
-        name
-        for name, spec in gymnasium.registry.items()
-        if not (str(spec.entry_point).startswith("gymnasium.envs.mujoco") and gone.search(name))
-    ]
+    """Ids that `make` accepts without a module, less those whose entry point only raises."""
+    registered = gymnasium.registry.items()
+    return [name for name, spec in registered if isinstance(spec.entry_point, str)]
 
 
 def _log_warning(message: str) -> None:

@@ -81,7 +81,7 @@ class Population:
         weight: Floats | None,
         statistics: Statistics,
         tick: int,
-    ) -> tuple[State, Floats, Array]:
+    ) -> tuple[State, Floats, Floats]:
         """One cycle of each ready member on its own rows (ready, U, B, width).
 
         All members at once, or one after the other: two programs, compiled once, for any K.
@@ -89,7 +89,7 @@ class Population:
         """
         if len(ready) == self.members:
             states, losses, error = self._update(states, rows, weight, statistics, self.key, tick)
-            return states, np.asarray(losses), error
+            return states, np.asarray(losses), np.asarray(error)
         parts: list[Any] = []
         for place, member in enumerate(ready):
             weights = None if weight is None else weight[place]
@@ -98,7 +98,7 @@ class Population:
             )
             parts.append(part)
         losses, errors = zip(*parts, strict=True)
-        return states, np.stack([np.asarray(loss) for loss in losses]), jnp.stack(errors)
+        return states, np.stack(losses), np.stack(errors)
 
     def inherit(self, states: State, parents: Parents, copy: str) -> State:
         """States in which each member starts again from its parent."""

@@ -106,7 +106,7 @@ class Replay:
         index = (self.head - size + rng.integers(size, size=shape)) % self.slots
         return Sample(self.rows.take(index, axis=0), index, None)
 
-    def feedback(self, slots: NDArray[np.int64], error: Array) -> None:
+    def feedback(self, slots: NDArray[np.int64], error: Floats) -> None:
         """What a prioritised replay learns from an update; a uniform one needs nothing."""
 
     def commit(self) -> dict[str, Any]:

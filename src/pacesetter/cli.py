@@ -1,0 +1,240 @@
+"""The command line: one function a verb, parsing and printing only."""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.flags import Parser, add_settings, parser, split_env_kwargs
+
+if TYPE_CHECKING:
+    from pacesetter.training.trainer import Trainer
+
+NOUNS = ("algorithms", "envs", "rules", "presets", "runs")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; 0 done, 2 bad input, 130 or 143 saved on a signal, 1 a run that failed."""
+    words = sys.argv[1:] if arguments is None else arguments
+    try:
+        if not words or words[0] in ("-h", "--help"):
+            print(_overview())
+            return 0 if words else 2
+        if words[0] == "--version":
+            from importlib.metadata import version
+
+            print(version("pacesetter"))
+            return 0
+        if words[0] not in VERBS:
+            raise unknown("verb", words[0], VERBS)
+        return VERBS[words[0]](words[1:])
+    except UsageError as error:
+        print(f"pacesetter: {error}", file=sys.stderr)
+        return 2
+    except TrainingError as error:
+        print(f"pacesetter: stopped: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def train(words: list[str]) -> int:
+    """Train ALGO on ENV into a new run directory."""
+    from pacesetter import algorithms
+    from pacesetter.config import Run, preset_layers, settle
+
+    command = parser("train ALGO ENV", "Train an algorithm on a task.")
+    if len(words) < 2 or words[0].startswith("-") or words[1].startswith("-"):
+        command.epilog = "`pacesetter train ALGO ENV --help` shows all its settings; see also list"
+        command.add_argument("ALGO", help="an algorithm or preset: `pacesetter list algorithms`")
+        command.add_argument("ENV", help="a Gymnasium id such as HalfCheetah-v5, or module:Id-v0")
+        command.parse(words)
+    algorithm, env, rest = words[0], words[1], words[2:]
+    base, _ = preset_layers(algorithm, env)
+    _fix_threads(None)
+    defaults = settle(algorithm, env).settings()
+    command.prog = f"pacesetter train {algorithm} {env}"
+    add_settings(command, "the run", Run, defaults)
+    add_settings(command, base, algorithms.find(base).Hyper, defaults)
+    command.add_argument("--env.KEY", metavar="VALUE", help="keyword of the env's constructor")
+    command.add_argument("--config", metavar="FILE", help="settings as .toml or .json")
+    _add_common(command)
+    rest, env_kwargs = split_env_kwargs(rest)
+    found = vars(command.parse(rest))
+    found.pop("env.KEY")
+    runs, quiet, config = found.pop("runs"), found.pop("quiet"), found.pop("config")
+    if env_kwargs:
+        found["env_kwargs"] = env_kwargs
+    from pacesetter.training.trainer import Trainer
+
+    return _train(Trainer(algorithm, env, runs=runs, config=config, **found), quiet)
+
+
+def resume(words: list[str]) -> int:
+    """Go on with a run from its last checkpoint."""
+    from pacesetter.runs import find
+
+    command = parser("resume", "Go on with a run from its last checkpoint, bit for bit.")
+    command.add_argument("run", metavar="RUN", help="its folder, or any tail that is unique")
+    command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
+    command.add_argument("--time", metavar="T", help="new budget of time, such as 2h")
+    _add_common(command)
+    found = command.parse(words)
+    directory = find(found.run, found.runs)
+    _fix_threads(directory.record().get("threads"))
+    from pacesetter.training.trainer import Trainer
+
+    trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
+    for note in trainer.notes:
+        print(f"pacesetter: {note}", file=sys.stderr)
+    return _train(trainer, found.quiet)
+
+
+def evaluate(words: list[str]) -> int:
+    """Score a policy on fresh episodes."""
+    import numpy as np
+
+    from pacesetter.evaluate import evaluate
+    from pacesetter.policy import load
+    from pacesetter.runs import find
+
+    command = parser("eval", "Score a run's champion, or a policy file, on fresh episodes.")
+    command.add_argument("run", metavar="RUN|FILE", help="a run, or a policy.safetensors")
+    command.add_argument("--episodes", type=int, default=100, metavar="N", help="default 100")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of the starts")
+    command.add_argument("--noise", type=float, default=0.0, metavar="X", help="on actions")
+    command.add_argument("--env", metavar="ID", help="the task, if not the one in the file")
+    command.add_argument("--json", action="store_true", help="print all returns as JSON")
+    command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
+    found = command.parse(words)
+    is_file = found.run.endswith(".safetensors")
+    path = Path(found.run) if is_file else find(found.run, found.runs).policy_file
+    policy = load(path)
+    env = found.env or (None if is_file else policy.about["env"])
+    result = evaluate(policy, env, found.episodes, found.seed, noise=found.noise)
+    about = {"env": env or policy.about["env"], "seed": found.seed, "noise": found.noise}
+    if found.json:
+        print(json.dumps({**result.table(), **about, "policy": str(path)}))
+    else:
+        steps = policy.about.get("step", 0)
+        print(
+            f"{about['env']}: return {result.mean:.1f} +- {result.std:.1f} over {found.episodes} "
+            f"episodes of {np.mean(result.lengths):.0f} steps; policy of step {steps:,}"
+        )
+    return 0
+
+
+def list_(words: list[str]) -> int:
+    """List what there is of a noun."""
+    command = parser("list", "List algorithms, envs, rules, presets or runs.")
+    command.add_argument("noun", metavar="|".join(NOUNS))
+    command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
+    found = command.parse(words)
+    if found.noun not in NOUNS:
+        raise unknown("list", found.noun, NOUNS)
+    from pacesetter import listing
+
+    for line in getattr(listing, found.noun)(*([found.runs] if found.noun == "runs" else [])):
+        print(line)
+    return 0
+
+
+def show(words: list[str]) -> int:
+    """Show one run."""
+    from pacesetter import listing
+    from pacesetter.runs import find
+
+    command = parser("show", "Show a run: its settings, what it spent and how it did.")
+    command.add_argument("run", metavar="RUN", help="its folder, or any tail that is unique")
+    command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
+    found = command.parse(words)
+    for line in listing.describe(find(found.run, found.runs)):
+        print(line)
+    return 0
+
+
+VERBS: dict[str, Callable[[list[str]], int]] = {
+    "train": train,
+    "resume": resume,
+    "eval": evaluate,
+    "list": list_,
+    "show": show,
+}
+
+
+def _overview() -> str:
+    lines = [f"  {verb:8}{(function.__doc__ or '').strip()}" for verb, function in VERBS.items()]
+    return "\n".join(
+        [
+            "usage: pacesetter VERB ...",
+            "",
+            "Train ensembles of agents that learn to walk, and prove what the ensemble is worth.",
+            "",
+            *lines,
+            "",
+            "Start with `pacesetter train multi-td3 HalfCheetah-v5`; `VERB --help` tells more.",
+        ]
+    )
+
+
+def _add_common(command: Parser) -> None:
+    command.add_argument("--runs", default="runs", metavar="DIR", help="where runs are")
+    command.add_argument("-q", "--quiet", action="store_true", help="no progress")
+
+
+def _fix_threads(count: int | None) -> None:
+    """Fix the size of XLA's thread pool, which decides result bits, before JAX is imported."""
+    if count is not None:
+        os.environ["NPROC"] = str(count)
+    os.environ.setdefault("NPROC", str(len(os.sched_getaffinity(0))))
+
+
+def _train(trainer: "Trainer", quiet: bool) -> int:
+    from pacesetter.sinks import console
+
+    final: Any = None
+    with _stopping_at_signals(trainer) as received, console(trainer, quiet) as sink:
+        for report in trainer:
+            sink(report)
+            final = report if report.kind == "eval" else final
+    run, step = trainer.config.run, trainer.progress.step
+    result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""
+    print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")
+    if received and not trainer.finished:
+        print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
+        return 130 if received[0] == signal.SIGINT else 143
+    print(f"policy: {trainer.directory.policy_file}")
+    return 0
+
+
+@contextmanager
+def _stopping_at_signals(trainer: "Trainer") -> Generator[list[int]]:
+    """The first signal ends the run cleanly after its tick; the second ends the process."""
+    received: list[int] = []
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if received:
+            os._exit(128 + number)
+        received.append(number)
+        trainer.stop()
+
+    watched = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+    before = {number: signal.signal(number, handle) for number in watched}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
