@@ -6,6 +6,7 @@ when the round is over, all start again from the rule's choice  _turn
 what is due is evaluated and logged; now and then all is saved  _report, _save
 """
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,8 +190,7 @@ class Trainer:
     def _set_up(self) -> None:
         run, hyper, first = self.config.run, self.config.hyper, self.envs[0]
         spec = Spec(first.observation_size, first.action_size)
-        if run.device != "auto":
-            jax.config.update("jax_default_device", _device(run.device))
+        _prepare_jax(run.device)
         self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
         columns = Columns(*spec, self.algorithm.masks)
         self.population = Population(
@@ -472,6 +472,17 @@ class _blame:  # noqa: N801 (a context manager reads as a verb)
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, Exception):
             raise TrainingError(f"{self.where}: {error}") from error
+
+
+def _prepare_jax(device: str) -> None:
+    """Choose the device and keep compiled programs between processes (JAX stores none by default)."""
+    if jax.config.jax_compilation_cache_dir is None:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if device != "auto":
+        jax.config.update("jax_default_device", _device(device))
 
 
 def _device(kind: str) -> Any:

@@ -1,0 +1,183 @@
+"""A film of a policy at its task, drawn without a display."""
+
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pacesetter.envs import Environment
+from pacesetter.errors import UsageError
+from pacesetter.policy import Policy
+from pacesetter.seeding import Stream
+
+Frame = NDArray[np.uint8]
+INSTALL = "apt-get install -y --no-install-recommends libegl1 libgl1"
+SUFFIXES = (".mp4", ".gif")
+
+
+def record(
+    policy: Policy,
+    path: str | Path,
+    *,
+    env: str | None = None,
+    frames: int = 200,
+    size: tuple[int, int] = (320, 240),
+    seed: int = 0,
+) -> int:
+    """Film seeded episodes, one after another, at the env's own pace; returns the frames written.
+
+    `size` is that of MuJoCo tasks; others draw in a size of their own.
+    """
+    path = Path(path)
+    _check(path, frames, size)
+    with _gl():
+        world = _enter(policy, env, seed)
+        try:
+            _aim(world, size)
+            rate = float(world.env.metadata.get("render_fps") or 30)
+            return _write(path, _film(policy, world, frames), rate)
+        finally:
+            world.close()
+
+
+def _check(path: Path, frames: int, size: tuple[int, int]) -> None:
+    if path.suffix not in SUFFIXES:
+        raise UsageError(f"video: {path} must end in {' or '.join(SUFFIXES)}")
+    if frames < 1:
+        raise UsageError(f"frames: must be at least 1, got {frames}")
+    # yuv420p, which every player shows, stores colour for two by two pixels.
+    if min(size) < 2 or any(side % 2 for side in size):
+        raise UsageError(f"size: both sides must be even, got {size[0]}x{size[1]}")
+
+
+@contextmanager
+def _gl() -> Iterator[None]:
+    """Let MuJoCo draw by EGL where no display is, and only in here.
+
+    MuJoCo comes first: with MUJOCO_GL=egl and no EGL it could never be imported again.
+    """
+    try:
+        import mujoco  # noqa: F401  # pyright: ignore[reportUnusedImport]
+    except Exception:
+        raise _no_gl() from None
+    chosen = os.environ.get("MUJOCO_GL")
+    if not chosen and not os.environ.get("DISPLAY"):
+        os.environ["MUJOCO_GL"] = "egl"
+    try:
+        yield
+    finally:
+        os.environ.pop("MUJOCO_GL", None)
+        if chosen is not None:
+            os.environ["MUJOCO_GL"] = chosen
+
+
+def _no_gl() -> UsageError:
+    backend = os.environ.get("MUJOCO_GL", "unset")
+    return UsageError(
+        f"video: no OpenGL to draw with (MUJOCO_GL={backend}); for MUJOCO_GL=egl run `{INSTALL}`"
+    )
+
+
+def _enter(policy: Policy, env: str | None, seed: int) -> Environment:
+    """The policy's task or the given one, in a mode that draws."""
+    name = env or policy.about.get("env")
+    if name is None:
+        raise UsageError("env: none given and the policy names none")
+    if env is None and ":" in name:
+        raise UsageError(
+            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
+        )
+    kwargs = policy.about.get("env_kwargs", {}) | {"render_mode": "rgb_array"}
+    world = Environment(name, kwargs, seed, Stream.REPORT)
+    world.check()
+    taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+    if (taken, given) != (world.observation_size, world.action_size):
+        raise UsageError(
+            f"env: {name} has observations of {world.observation_size} and actions of "
+            f"{world.action_size}; the policy takes {taken} and gives {given}"
+        )
+    return world
+
+
+def _aim(world: Environment, size: tuple[int, int]) -> None:
+    """Set MuJoCo's size and the camera that follows the walker; by default it would walk away."""
+    import mujoco
+    from gymnasium.envs.mujoco import MujocoEnv
+
+    task: Any = world.env.unwrapped
+    if not isinstance(task, MujocoEnv):
+        return
+    _try_gl()
+    library: Any = mujoco
+    model, renderer = task.model, task.mujoco_renderer
+    renderer.width, renderer.height = size
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
+    model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
+    if renderer.camera_id == -1:
+        renderer.camera_id = library.mj_name2id(model, library.mjtObj.mjOBJ_CAMERA, "track")
+
+
+def _try_gl() -> None:
+    """Fail here rather than in Gymnasium, which prints a traceback when it frees what failed."""
+    backend = os.environ.get("MUJOCO_GL")
+    if backend not in ("egl", "osmesa"):
+        return
+    try:
+        importlib.import_module(f"mujoco.{backend}").GLContext(1, 1).free()
+    except Exception:
+        raise _no_gl() from None
+
+
+def _film(policy: Policy, world: Environment, frames: int) -> Iterator[Frame]:
+    observation = world.reset()
+    for _ in range(frames):
+        yield _draw(world)
+        step = world.step(policy.act(observation))
+        observation = world.reset() if step.ended else step.observation
+
+
+def _draw(world: Environment) -> Frame:
+    try:
+        frame: Any = world.env.render()
+    except Exception as error:
+        if type(error).__module__.startswith("mujoco") or "OpenGL" in str(error):
+            raise _no_gl() from None
+        raise UsageError(f"env: {world.name} cannot be drawn: {error}") from None
+    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.dtype != np.uint8:
+        raise UsageError(f"env: {world.name} gives no picture in the mode rgb_array")
+    return frame
+
+
+def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
+    import imageio.v2
+
+    library: Any = imageio.v2
+    first = next(film)  # so that no file is made where nothing can be drawn
+    written = 0
+    try:
+        with library.get_writer(path, **_options(path.suffix, rate)) as writer:
+            for frame in chain([first], film):
+                writer.append_data(frame)
+                written += 1
+    except OSError as error:
+        raise UsageError(f"video: cannot write {path}: {error.strerror or error}") from None
+    return written
+
+
+def _options(suffix: str, rate: float) -> dict[str, Any]:
+    if suffix == ".gif":
+        # Hundredths of a second are all a GIF knows, and below two of them viewers play it at ten.
+        return {"mode": "I", "duration": max(20, round(100 / rate) * 10), "loop": 0}
+    return {
+        "format": "FFMPEG",
+        "fps": rate,
+        "codec": "libx264",
+        "pixelformat": "yuv420p",
+        "macro_block_size": 2,
+    }

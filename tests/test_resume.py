@@ -1,0 +1,65 @@
+"""A run that is stopped and resumed equals the run that never stopped, bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import TINY, assert_same, run_to_end
+
+from pacesetter.training import replay
+from pacesetter.training.trainer import Trainer
+
+CASES = {
+    "td3": {"env": "HalfCheetah-v5"},
+    "multi-td3": {"env": "HalfCheetah-v5", "steps": 4_300},
+    "multi-ant": {"env": "Ant-v5", "algorithm": "multi-td3", "members": 3},
+    "wrapped": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_size": 300},
+    "ou": {"env": "Hopper-v5", "algorithm": "ddpg", "exploration": "ou", "members": 2},
+    "normalized": {"env": "Walker2d-v5", "algorithm": "multi-td3", "normalize_observation": True},
+    "trials": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "select_on": "eval",
+        "select_every": 500,
+    },
+    "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
+    "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
+    "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
+}
+
+
+def start(case: str, runs: Path, name: str) -> Trainer:
+    settings = {**TINY, "steps": 2_300, "algorithm": "td3", "name": name, **CASES[case]}
+    return Trainer(settings.pop("algorithm"), settings.pop("env"), runs=runs, **settings)
+
+
+def stop_at(trainer: Trainer, tick: int) -> None:
+    """Run until a tick has passed, then end as a signal would."""
+    turn = trainer._turn
+
+    def turn_and_stop() -> None:
+        turn()
+        if trainer.progress.tick >= tick:
+            trainer.stop()
+
+    trainer._turn = turn_and_stop
+    run_to_end(trainer)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_stopped_anywhere_equals_uninterrupted(
+    case: str, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Small blocks, so that the ring of the `wrapped` case really goes round several times.
+    monkeypatch.setattr(replay, "BLOCK", 64)
+    monkeypatch.setattr(replay, "UNCOMMITTED", 150)
+    monkeypatch.setattr(replay, "SLACK", 2 * 150 + 64)
+    whole = run_to_end(start(case, runs, "whole"))
+    stopped = start(case, runs, "stopped")
+    ticks = np.sort(np.random.default_rng(len(case)).choice(900, size=3, replace=False))
+    for tick in ticks:
+        stop_at(stopped, int(tick))
+        assert not stopped.finished
+        stopped = Trainer.resume(stopped.directory.path)
+        assert stopped.notes == []
+    assert_same(whole, run_to_end(stopped))
