@@ -2,7 +2,7 @@
 
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
@@ -43,7 +43,7 @@ def record(
             rate = float(world.env.metadata.get("render_fps") or 30)
             return _write(path, _film(policy, world, frames), rate)
         finally:
-            world.close()
+            _leave(world)
 
 
 def _check(path: Path, frames: int, size: tuple[int, int]) -> None:
@@ -57,7 +57,7 @@ def _check(path: Path, frames: int, size: tuple[int, int]) -> None:
 
 
 @contextmanager
-def _gl() -> Iterator[None]:
+def _gl() -> Generator[None]:
     """Let MuJoCo draw by EGL where no display is, and only in here.
 
     MuJoCo comes first: with MUJOCO_GL=egl and no EGL it could never be imported again.
@@ -108,19 +108,36 @@ def _enter(policy: Policy, env: str | None, seed: int) -> Environment:
 def _aim(world: Environment, size: tuple[int, int]) -> None:
     """Set MuJoCo's size and the camera that follows the walker; by default it would walk away."""
     import mujoco
-    from gymnasium.envs.mujoco import MujocoEnv
 
-    task: Any = world.env.unwrapped
-    if not isinstance(task, MujocoEnv):
+    if not _is_mujoco(world):
         return
     _try_gl()
     library: Any = mujoco
+    task: Any = world.env.unwrapped
     model, renderer = task.model, task.mujoco_renderer
     renderer.width, renderer.height = size
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
     model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
     if renderer.camera_id == -1:
         renderer.camera_id = library.mj_name2id(model, library.mjtObj.mjOBJ_CAMERA, "track")
+
+
+def _is_mujoco(world: Environment) -> bool:
+    from gymnasium.envs.mujoco import MujocoEnv
+
+    return isinstance(world.env.unwrapped, MujocoEnv)
+
+
+def _leave(world: Environment) -> None:
+    """Close the env; MuJoCo's picture buffers first.
+
+    Garbage collection would free them by number in whatever film is drawn then, and blacken it.
+    """
+    task: Any = world.env.unwrapped
+    if _is_mujoco(world) and (viewer := task.mujoco_renderer.viewer) is not None:
+        viewer.make_context_current()
+        viewer.con.free()
+    world.close()
 
 
 def _try_gl() -> None:
@@ -146,7 +163,7 @@ def _draw(world: Environment) -> Frame:
     try:
         frame: Any = world.env.render()
     except Exception as error:
-        if type(error).__module__.startswith("mujoco") or "OpenGL" in str(error):
+        if _is_mujoco(world):
             raise _no_gl() from None
         raise UsageError(f"env: {world.name} cannot be drawn: {error}") from None
     if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.dtype != np.uint8:

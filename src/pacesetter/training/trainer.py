@@ -475,7 +475,7 @@ class _blame:  # noqa: N801 (a context manager reads as a verb)
 
 
 def _prepare_jax(device: str) -> None:
-    """Choose the device and keep compiled programs between processes (JAX stores none by default)."""
+    """Choose the device and keep compiled programs, of which JAX stores none by default."""
     if jax.config.jax_compilation_cache_dir is None:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter"))
