@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TINY, assert_same, run_to_end
 
+from conftest import TINY, assert_same, run_to_end
 from pacesetter.training import replay
 from pacesetter.training.trainer import Trainer
 

@@ -476,7 +476,7 @@ class _blame:  # noqa: N801 (a context manager reads as a verb)
 
 def _prepare_jax(device: str) -> None:
     """Choose the device and keep compiled programs, of which JAX stores none by default."""
-    if jax.config.jax_compilation_cache_dir is None:
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
