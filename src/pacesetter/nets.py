@@ -1,9 +1,12 @@
 """Multi-layer perceptrons as plain pytrees: a tuple of layers, each a dict of arrays."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 
 Array = jax.Array
 Layer = dict[str, Array]
@@ -71,3 +74,21 @@ def critic(network: Network, observation: Array, action: Array, action_layer: in
     for layer in network[:action_layer]:
         x = hidden_layer(layer, x, jax.nn.relu)
     return apply(network[action_layer:], jnp.concatenate([x, action], axis=-1))[..., 0]
+
+
+def critics(networks: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
+    """Values (N, B) of N critics, whose leaves carry a leading axis of N, for one batch."""
+    count = networks[0]["kernel"].shape[0]
+    # Each critic gets inputs of its own: from shared ones XLA makes one wide product whose result
+    # it then has to transpose, which costs 5% of an update.
+    inputs = jax.tree.map(lambda x: jnp.stack([x] * count), (observation, action))
+    one = partial(critic, action_layer=action_layer)
+    return jax.vmap(one)(networks, *jax.lax.optimization_barrier(inputs))
+
+
+def descend(
+    optimizer: optax.GradientTransformation, parameters: Any, gradient: Any, moments: Any
+) -> tuple[Any, Any]:
+    """One optimiser step: the moved parameters and the new moments."""
+    change, moments = optimizer.update(gradient, moments, parameters)
+    return optax.apply_updates(parameters, change), moments

@@ -122,11 +122,7 @@ class TD3:
 
     def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
-        one = partial(nets.critic, action_layer=self.action_layer)
-        # Each critic gets inputs of its own: from shared ones XLA makes one wide product whose
-        # result it then has to transpose, which costs 5% of an update.
-        inputs = jax.tree.map(lambda x: jnp.stack([x] * self.hyper.critics), (observation, action))
-        return jax.vmap(one)(critic, *jax.lax.optimization_barrier(inputs))
+        return nets.critics(critic, observation, action, self.action_layer)
 
     def fit_critic(
         self, state: State, batch: Batch, y: Array, weight: Array
@@ -138,7 +134,9 @@ class TD3:
             return (weight * error**2).mean(axis=1).sum(), jnp.abs(error).max(axis=0)
 
         (value, error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
-        critic, optimizer = _step(self._critic_adam, state.critic, gradient, state.critic_optimizer)
+        critic, optimizer = nets.descend(
+            self._critic_adam, state.critic, gradient, state.critic_optimizer
+        )
         state = state._replace(critic=critic, critic_optimizer=optimizer, updates=state.updates + 1)
         return state, value, error
 
@@ -151,7 +149,9 @@ class TD3:
             return -nets.critic(first, batch.observation, action, self.action_layer).mean()
 
         value, gradient = jax.value_and_grad(loss)(state.actor)
-        actor, optimizer = _step(self._actor_adam, state.actor, gradient, state.actor_optimizer)
+        actor, optimizer = nets.descend(
+            self._actor_adam, state.actor, gradient, state.actor_optimizer
+        )
         soften: Callable[..., Any] = partial(optax.incremental_update, step_size=self.hyper.tau)
         state = state._replace(
             actor=actor,
@@ -185,11 +185,6 @@ class TD3:
     def _critic_adam(self) -> optax.GradientTransformation:
         decay = [optax.add_decayed_weights(self.critic_decay)] if self.critic_decay else []
         return optax.chain(*decay, optax.adam(self.hyper.critic_learning_rate))
-
-
-def _step(adam: optax.GradientTransformation, network: Any, gradient: Any, optimizer: Any) -> Any:
-    change, optimizer = adam.update(gradient, optimizer, network)
-    return optax.apply_updates(network, change), optimizer
 
 
 build = TD3
