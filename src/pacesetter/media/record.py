@@ -67,20 +67,28 @@ def _gl() -> Generator[None]:
     except Exception:
         raise _no_gl() from None
     chosen = os.environ.get("MUJOCO_GL")
-    if not chosen and not os.environ.get("DISPLAY"):
-        os.environ["MUJOCO_GL"] = "egl"
+    with _setting("MUJOCO_GL", chosen if chosen or os.environ.get("DISPLAY") else "egl"):
+        yield
+
+
+@contextmanager
+def _setting(name: str, value: str | None) -> Generator[None]:
+    """An environment variable for a while, for libraries that are told things only so."""
+    before = os.environ.get(name)
     try:
+        if value is not None:
+            os.environ[name] = value
         yield
     finally:
-        os.environ.pop("MUJOCO_GL", None)
-        if chosen is not None:
-            os.environ["MUJOCO_GL"] = chosen
+        os.environ.pop(name, None)
+        if before is not None:
+            os.environ[name] = before
 
 
 def _no_gl() -> UsageError:
     backend = os.environ.get("MUJOCO_GL", "unset")
     return UsageError(
-        f"video: no OpenGL to draw with (MUJOCO_GL={backend}); for MUJOCO_GL=egl run `{INSTALL}`"
+        f"video: no OpenGL to draw with (MUJOCO_GL={backend}); MUJOCO_GL=egl needs `{INSTALL}`"
     )
 
 
@@ -178,12 +186,18 @@ def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
     first = next(film)  # so that no file is made where nothing can be drawn
     written = 0
     try:
-        with library.get_writer(path, **_options(path.suffix, rate)) as writer:
+        path.open("wb").close()  # a refusal comes as one line here, from ffmpeg as many
+        # Otherwise ffmpeg is started by a plain fork, which JAX's threads make unsafe.
+        with (
+            _setting("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1"),
+            library.get_writer(path, **_options(path.suffix, rate)) as writer,
+        ):
             for frame in chain([first], film):
                 writer.append_data(frame)
                 written += 1
     except OSError as error:
-        raise UsageError(f"video: cannot write {path}: {error.strerror or error}") from None
+        reason = error.strerror or str(error).splitlines()[0]
+        raise UsageError(f"video: cannot write {path}: {reason}") from None
     return written
 
 

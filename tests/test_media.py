@@ -1,0 +1,276 @@
+"""Films and curves: what is written can be read back, and what is missing is said in one line."""
+
+import gc
+import json
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from pacesetter.envs import Environment, make
+from pacesetter.errors import UsageError
+from pacesetter.media.curve import curve
+from pacesetter.media.record import INSTALL, record
+from pacesetter.policy import Policy
+from pacesetter.runs import RunDirectory
+
+TOLD = ("MUJOCO_GL", "IMAGEIO_FFMPEG_NO_PREVENT_SIGINT")
+
+
+def untrained(env: str, **about: Any) -> Policy:
+    """One linear layer of the right size."""
+    world = make(env)
+    observations, actions = world.observation_space.shape, world.action_space.shape
+    world.close()
+    assert observations is not None
+    assert actions is not None
+    weights = np.random.default_rng(3).normal(0, 0.3, (observations[0], actions[0]))
+    kernel, bias = weights.astype(np.float32), np.zeros(actions, np.float32)
+    bound = np.ones(actions, np.float32)
+    layers = [{"kernel": kernel, "bias": bias}]
+    return Policy([layers], "relu", "tanh", -bound, bound, about={"env": env, **about})
+
+
+@pytest.fixture
+def cheetah() -> Policy:
+    return untrained("HalfCheetah-v5")
+
+
+@pytest.fixture
+def gl(cheetah: Policy, tmp_path: Path) -> None:
+    """Skip where this machine cannot draw; MuJoCo needs OpenGL, which pip does not install."""
+    try:
+        record(cheetah, tmp_path / "probe.gif", frames=1)
+    except UsageError as error:
+        if INSTALL not in str(error):
+            raise
+        pytest.skip(str(error))
+
+
+def frames_of(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], dict[str, Any]]:
+    """All frames of a film and what its header says."""
+    import imageio.v2
+
+    # ffmpeg would be started by a fork, of which JAX warns.
+    monkeypatch.setenv("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")
+    library: Any = imageio.v2
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)  # imageio's reader leaves its pipes open
+        with library.get_reader(path) as reader:
+            found = [np.array(frame) for frame in reader], reader.get_meta_data()
+        del reader
+        gc.collect()
+    return found
+
+
+@pytest.mark.usefixtures("gl")
+def test_mp4_has_the_frames_size_and_pace_of_the_task(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jax.devices()  # its threads make every plain fork a warning, so an error here
+    before = {name: os.environ.get(name) for name in TOLD}
+    assert record(cheetah, tmp_path / "film.mp4", frames=10) == 10
+    assert {name: os.environ.get(name) for name in TOLD} == before
+    frames, about = frames_of(tmp_path / "film.mp4", monkeypatch)
+    assert [frame.shape for frame in frames] == [(240, 320, 3)] * 10
+    assert about["fps"] == 20
+    assert about["codec"] == "h264"
+    assert about["pix_fmt"].startswith("yuv420p")
+    assert not np.array_equal(frames[0], frames[-1])
+
+
+@pytest.mark.usefixtures("gl")
+def test_gif_of_another_version_of_the_task(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "film.gif"
+    assert record(cheetah, path, env="HalfCheetah-v4", frames=5, size=(64, 48)) == 5
+    frames, about = frames_of(path, monkeypatch)
+    assert [frame.shape[:2] for frame in frames] == [(48, 64)] * 5
+    assert about["duration"] == 50
+
+
+@pytest.mark.usefixtures("gl")
+def test_episodes_that_end_early_start_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered: list[int] = []
+    reset = Environment.reset
+
+    def count(world: Environment, episode: int | None = None) -> Any:
+        observation = reset(world, episode)
+        entered.append(world.episode)
+        return observation
+
+    monkeypatch.setattr(Environment, "reset", count)
+    pendulum = untrained("InvertedPendulum-v5")
+    assert record(pendulum, tmp_path / "falls.mp4", frames=60) == 60
+    assert len(frames_of(tmp_path / "falls.mp4", monkeypatch)[0]) == 60
+    assert entered[1:4] == [0, 1, 2]  # the first entry of all is the check
+
+
+@pytest.mark.usefixtures("gl")
+def test_camera_follows_the_walker_far_from_the_start(cheetah: Policy) -> None:
+    from pacesetter.media import record as module
+
+    with module._gl():
+        world = module._enter(cheetah, None, 0)
+        module._aim(world, (320, 240))
+        world.reset(0)
+        task: Any = world.env.unwrapped
+        near = module._draw(world)
+        task.data.qpos[0] += 30.0
+        task.set_state(task.data.qpos, task.data.qvel)
+        far = module._draw(world)
+        module._leave(world)
+    # The cheetah is the only thing with more red than blue.
+    columns = [np.nonzero(frame[..., 0] > frame[..., 2] + 40.0)[1] for frame in (near, far)]
+    assert columns[0].size > 500
+    assert columns[1].size > 500
+    assert columns[1].mean() == pytest.approx(columns[0].mean(), abs=10)
+
+
+@pytest.mark.usefixtures("gl")
+def test_an_old_film_that_is_freed_late_leaves_a_new_one_alone(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pacesetter.media import record as module
+
+    kept: list[Any] = []
+    leave, draw = module._leave, module._draw
+
+    def leave_and_keep(world: Any) -> None:
+        kept.append(world.env.unwrapped)
+        leave(world)
+
+    def draw_and_forget(world: Any) -> Any:
+        frame = draw(world)
+        kept.clear()
+        return frame
+
+    monkeypatch.setattr(module, "_leave", leave_and_keep)
+    record(cheetah, tmp_path / "old.gif", frames=2, size=(32, 32))
+    monkeypatch.setattr(module, "_draw", draw_and_forget)
+    record(cheetah, tmp_path / "new.mp4", frames=4)
+    frames, _ = frames_of(tmp_path / "new.mp4", monkeypatch)
+    assert min(frame.mean() for frame in frames) > 50
+
+
+def test_missing_gl_is_one_line_that_says_what_to_install(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setitem(sys.modules, "mujoco.egl", None)
+    with pytest.raises(UsageError, match="libegl1 libgl1") as caught:
+        record(cheetah, tmp_path / "film.mp4")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "film.mp4").exists()
+
+
+def test_mujoco_that_cannot_even_be_imported_is_the_same_line(tmp_path: Path) -> None:
+    code = """
+import sys
+import numpy as np
+from pacesetter.errors import UsageError
+from pacesetter.media.record import record
+from pacesetter.policy import Policy
+one = np.ones((1, 1), np.float32)
+policy = Policy([[{"kernel": one, "bias": one[0]}]], "relu", "tanh", -one[0], one[0])
+try:
+    record(policy, sys.argv[1], env="HalfCheetah-v5")
+except UsageError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "film.mp4")],
+        env={**os.environ, "MUJOCO_GL": "bogus"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.count("\n") == 1
+    assert INSTALL in done.stdout
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"path": "film.avi"}, r"\.mp4 or \.gif"),
+        ({"frames": 0}, "frames: must be at least 1"),
+        ({"size": (321, 240)}, "size: both sides must be even"),
+        ({"env": "Hopper-v5"}, "observations of 11"),
+        ({"env": "HalfCheetah-v77"}, "unknown 'HalfCheetah-v77'"),
+    ],
+)
+def test_bad_input_is_one_line(
+    cheetah: Policy, tmp_path: Path, settings: dict[str, Any], said: str
+) -> None:
+    path = tmp_path / settings.get("path", "film.mp4")
+    rest = {key: value for key, value in settings.items() if key != "path"}
+    with pytest.raises(UsageError, match=said):
+        record(cheetah, path, **rest)
+    assert not path.exists()
+
+
+@pytest.mark.usefixtures("gl")
+def test_a_folder_that_is_not_there_is_one_line(cheetah: Policy, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file"):
+        record(cheetah, tmp_path / "none" / "film.mp4", frames=1)
+
+
+def test_a_file_cannot_make_its_reader_import_a_module(tmp_path: Path) -> None:
+    policy = untrained("HalfCheetah-v5")
+    policy.about["env"] = "os:HalfCheetah-v5"
+    with pytest.raises(UsageError, match="allow it with --env"):
+        record(policy, tmp_path / "film.mp4")
+
+
+def handmade(folder: Path, rows: list[dict[str, Any]]) -> RunDirectory:
+    """A run of only a config and a log."""
+    folder.mkdir()
+    settings = {"env": "HalfCheetah-v5", "name": "tiny", "seed": 4}
+    (folder / "config.json").write_text(json.dumps({"schema": 1, "settings": settings}))
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return RunDirectory(folder)
+
+
+def evaluation(step: int, *returns: float) -> dict[str, Any]:
+    return {"kind": "eval", "step": step, "returns": returns, "mean": float(np.mean(returns))}
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_curve_draws_evaluations_and_training(tmp_path: Path, suffix: str) -> None:
+    rows = [
+        evaluation(0, -1.0, -2.0),
+        {"kind": "train", "step": 1000, "episodes_ended": [[0, -300.0, 500], [1, -200.0, 500]]},
+        {"kind": "select", "step": 1000, "parents": [1, 1]},
+        evaluation(2000, 100.0, 300.0),
+    ]
+    path = tmp_path / f"curve.{suffix}"
+    curve(handmade(tmp_path / "run", rows), path)
+    if suffix == "svg":
+        text = path.read_text()
+        for said in ("HalfCheetah-v5, tiny, seed 4", "env steps, all members", "mean of 2"):
+            assert said in text
+    else:
+        import imageio.v3
+
+        library: Any = imageio.v3
+        assert library.imread(path).shape[:2] == (540, 960)
+
+
+def test_curve_needs_an_evaluation_and_a_known_suffix(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no evaluation"):
+        curve(handmade(tmp_path / "new", []), tmp_path / "curve.png")
+    run = handmade(tmp_path / "run", [evaluation(0, 1.0)])
+    with pytest.raises(UsageError, match=r"\.png"):
+        curve(run, tmp_path / "curve.walk")
+    with pytest.raises(UsageError, match="cannot write"):
+        curve(run, tmp_path / "none" / "curve.png")
