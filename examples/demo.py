@@ -13,7 +13,7 @@ from tabulate import tabulate
 
 from pacesetter import Trainer, load
 from pacesetter.errors import TrainingError, UsageError
-from pacesetter.evaluate import evaluate
+from pacesetter.evaluation import evaluate
 from pacesetter.media.curve import curve
 from pacesetter.media.record import record
 from pacesetter.policy import Policy

@@ -3,14 +3,14 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pacesetter.evaluate import evaluate
+    from pacesetter.evaluation import evaluate
     from pacesetter.policy import load
     from pacesetter.training.trainer import Trainer
 
 __all__ = ["Trainer", "evaluate", "load"]
 _HOMES = {
     "Trainer": "pacesetter.training.trainer",
-    "evaluate": "pacesetter.evaluate",
+    "evaluate": "pacesetter.evaluation",
     "load": "pacesetter.policy",
 }
 

@@ -6,8 +6,9 @@ Axes: K members, U updates a cycle, B batch, T time, E environments, N networks 
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import numpy as np
 
-from pacesetter.policy import Actors
+from pacesetter.policy import Actors, Floats
 
 Array = jax.Array
 State = Any
@@ -66,14 +67,21 @@ class Algorithm(Protocol):
         """Networks, targets and optimiser of a new learner."""
         ...
 
-    def begin(self, state: State, key: Array) -> Memory:
-        """What acting remembers within one episode, made anew at its start."""
+    def acting(self, state: State) -> Any:
+        """The part of a state that acting needs; no more than chosen, since states are stacked."""
+        ...
+
+    def begin(self, acting: Any, rng: np.random.Generator) -> Memory:
+        """What acting remembers within one episode, made anew at its start, in NumPy."""
         ...
 
     def act(
-        self, state: State, memory: Memory, observation: Array, key: Array
-    ) -> tuple[Array, Memory]:
-        """Exploring action (A,) in [-1, 1] for one observation (O,)."""
+        self, acting: Any, memory: Memory, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Memory]:
+        """Exploring action (A,) in [-1, 1] for one observation (O,).
+
+        In NumPy: for one observation that is several times faster than calling into JAX.
+        """
         ...
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:

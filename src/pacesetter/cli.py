@@ -103,7 +103,7 @@ def evaluate(words: list[str]) -> int:
     """Score a policy on fresh episodes."""
     import numpy as np
 
-    from pacesetter.evaluate import evaluate
+    from pacesetter.evaluation import evaluate
     from pacesetter.policy import load
     from pacesetter.runs import find
 

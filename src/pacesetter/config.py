@@ -105,6 +105,11 @@ class Config(NamedTuple):
     run: Run
     hyper: Any
 
+    @property
+    def unit(self) -> int:
+        """Steps of all members that budget and clocks count as one."""
+        return self.run.members if self.run.count == "member" else 1
+
     def settings(self) -> Settings:
         """All settings as one flat table, which `settle` takes back."""
         return asdict(self.run) | asdict(self.hyper)

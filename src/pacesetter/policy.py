@@ -1,6 +1,6 @@
 """A trained policy as one small file, and what it does in NumPy alone: no JAX, no training code."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,23 +12,36 @@ from pacesetter import storage
 from pacesetter.errors import UsageError
 
 Floats = NDArray[np.float32]
-Layers = list[dict[str, Floats]]
+Layers = Sequence[dict[str, Floats]]
 KIND = "policy"
 SCHEMA = 1
 NORM_EPSILON = np.float32(1e-5)
 OBSERVATION_LIMIT = 10.0
 
 
-def _relu(x: Floats) -> Floats:
+def relu(x: Floats) -> Floats:
     return np.maximum(x, np.float32(0))
 
 
-def _clip(x: Floats) -> Floats:
-    return np.clip(x, np.float32(-1), np.float32(1))
+def clip(x: Floats, low: float = -1.0, high: float = 1.0) -> Floats:
+    """Cut to a range, quicker than np.clip for the few numbers of an action."""
+    return np.minimum(np.maximum(x, np.float32(low)), np.float32(high))
 
 
-ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"relu": _relu, "tanh": np.tanh}
-OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": _clip}
+ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"relu": relu, "tanh": np.tanh}
+OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": clip}
+
+
+def forward(layers: Layers, x: Floats, activation: Callable[[Floats], Floats] = relu) -> Floats:
+    """The linear output (..., outputs) of one network: what `nets.apply` is in JAX."""
+    for layer in layers[:-1]:
+        x = x @ layer["kernel"] + layer["bias"]
+        if "scale" in layer:
+            centred = x - x.mean(axis=-1, keepdims=True)
+            variance = (centred**2).mean(axis=-1, keepdims=True)
+            x = centred / np.sqrt(variance + NORM_EPSILON) * layer["scale"] + layer["offset"]
+        x = activation(x)
+    return x @ layers[-1]["kernel"] + layers[-1]["bias"]
 
 
 class Actors(NamedTuple):
@@ -41,8 +54,8 @@ class Actors(NamedTuple):
 
 def to_env(action: Floats, low: Floats, high: Floats) -> Floats:
     """Clip an action to [-1, 1] and scale it to the env's own bounds; nowhere else is this done."""
-    scaled = low + (high - low) * (_clip(action) + np.float32(1)) / np.float32(2)
-    return np.clip(scaled, low, high).astype(np.float32)
+    scaled = low + (high - low) * (clip(action) + np.float32(1)) / np.float32(2)
+    return np.minimum(np.maximum(scaled, low), high)
 
 
 def normalize(observation: Floats, mean: Floats, deviation: Floats) -> Floats:
@@ -78,19 +91,9 @@ class Policy:
             raise UsageError(f"observation: shape {x.shape} given; this policy takes (..., {size})")
         if self.normalizer is not None:
             x = normalize(x, *self.normalizer)
-        actions = [self._forward(layers, x) for layers in self.actors]
+        output, activation = OUTPUTS[self.output], ACTIVATIONS[self.activation]
+        actions = [output(forward(layers, x, activation)) for layers in self.actors]
         return actions[0] if len(actions) == 1 else np.asarray(np.mean(actions, axis=0))
-
-    def _forward(self, layers: Layers, x: Floats) -> Floats:
-        activation = ACTIVATIONS[self.activation]
-        for layer in layers[:-1]:
-            x = x @ layer["kernel"] + layer["bias"]
-            if "scale" in layer:
-                centred = x - x.mean(axis=-1, keepdims=True)
-                variance = (centred**2).mean(axis=-1, keepdims=True)
-                x = centred / np.sqrt(variance + NORM_EPSILON) * layer["scale"] + layer["offset"]
-            x = activation(x)
-        return OUTPUTS[self.output](x @ layers[-1]["kernel"] + layers[-1]["bias"])
 
     def save(self, path: str | Path) -> None:
         """Write the policy file; it holds all that acting needs."""

@@ -163,12 +163,16 @@ def provenance() -> Row:
     """What a result needs to be repeated: command, versions, commit, machine, thread count."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "versions": {name: version(name) for name in PACKAGES}
-        | {"python": platform.python_version()},
+        "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
         "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide results."""
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
 
 
 def _commit() -> str | None:

@@ -15,6 +15,7 @@ class Stream(IntEnum):
     WARMUP = 4
     SAMPLE = 5
     RULE = 6
+    ACT = 7
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

@@ -1,6 +1,7 @@
 """Where reports go besides the log: a progress bar on a terminal, plain lines elsewhere."""
 
 import sys
+from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -25,22 +26,24 @@ def console(trainer: "Trainer", quiet: bool = False) -> Generator[Sink]:
 
 
 class _Pace:
-    """Speed since the start of this process and what is left of both budgets."""
+    """Speed over the last reports and what is left of both budgets."""
 
     def __init__(self, trainer: "Trainer") -> None:
         self.trainer = trainer
-        self.step = trainer.progress.step
-        self.seconds = trainer.progress.wall_seconds
+        start = (trainer.progress.step, trainer.progress.wall_seconds)
+        self.marks = deque([start], maxlen=10)
 
     def read(self, report: "Report") -> tuple[float, str]:
         """Steps a second and the time left as text."""
         seconds = report.ledger["wall_seconds"]
-        speed = (report.step - self.step) / max(seconds - self.seconds, 1e-9)
+        self.marks.append((report.step, seconds))
+        first_step, first_seconds = self.marks[0]
+        speed = (report.step - first_step) / max(seconds - first_seconds, 1e-9)
         left = (self.trainer.budget - report.step) / max(speed, 1e-9) if report.step else 0.0
         limit = self.trainer.config.run.time
         if limit is not None:
             left = min(left, max(limit - seconds, 0.0))
-        known = report.step > self.step
+        known = report.step > first_step
         return speed, str(timedelta(seconds=round(left))) if known else "-"
 
 
@@ -48,8 +51,8 @@ def _lines(trainer: "Trainer") -> Sink:
     pace = _Pace(trainer)
 
     def show(report: "Report") -> None:
+        speed, left = pace.read(report)
         if report.kind == "eval":
-            speed, left = pace.read(report)
             values = report.values
             print(
                 f"step {report.step:,}  return {values['mean']:.1f} +- {values['std']:.1f}  "

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
@@ -21,7 +22,7 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter import nets
 from pacesetter.algorithm import Array, Batch, Spec, Update
 from pacesetter.config import STRICT, Count, OffPolicy
-from pacesetter.policy import Actors
+from pacesetter.policy import Actors, Floats, Layers, clip, forward
 
 LOG_STD_RANGE = (-20.0, 2.0)
 
@@ -85,13 +86,18 @@ class SAC:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def begin(self, state: State, key: Array) -> tuple[()]:
+    def acting(self, state: State) -> nets.Network:
+        return state.actor
+
+    def begin(self, acting: Layers, rng: np.random.Generator) -> tuple[()]:
         return ()
 
     def act(
-        self, state: State, memory: tuple[()], observation: Array, key: Array
-    ) -> tuple[Array, tuple[()]]:
-        return sample(state.actor, observation, key)[0], memory
+        self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        mean, log_std = np.split(forward(acting, observation), 2)
+        noise = rng.standard_normal(len(mean), np.float32)
+        return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise), memory
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         target_key, actor_key = jax.random.split(key)

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
@@ -22,7 +23,7 @@ from pacesetter import nets
 from pacesetter.algorithm import Array, Batch, Spec, Update
 from pacesetter.config import STRICT, OffPolicy
 from pacesetter.exploration import KINDS
-from pacesetter.policy import Actors
+from pacesetter.policy import Actors, Floats, Layers, clip, forward
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -84,14 +85,18 @@ class TD3:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def begin(self, state: State, key: Array) -> Any:
+    def acting(self, state: State) -> nets.Network:
+        return state.actor
+
+    def begin(self, acting: Layers, rng: np.random.Generator) -> Any:
         return KINDS[self.hyper.exploration].begin(self.spec.action_size)
 
-    def act(self, state: State, memory: Any, observation: Array, key: Array) -> tuple[Array, Any]:
+    def act(
+        self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
         explore = KINDS[self.hyper.exploration].noise
-        scale, size = self.hyper.exploration_noise, self.spec.action_size
-        noise, memory = explore(memory, scale, key, size)
-        return jnp.clip(nets.actor(state.actor, observation) + noise, -1, 1), memory
+        noise, memory = explore(memory, self.hyper.exploration_noise, self.spec.action_size, rng)
+        return clip(np.tanh(forward(acting, observation)) + noise), memory
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         def critic_step(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
+from pacesetter.evaluation import enter
 from pacesetter.policy import Policy
-from pacesetter.seeding import Stream
 
 Frame = NDArray[np.uint8]
 INSTALL = "apt-get install -y --no-install-recommends libegl1 libgl1"
@@ -37,7 +37,7 @@ def record(
     path = Path(path)
     _check(path, frames, size)
     with _gl():
-        world = _enter(policy, env, seed)
+        world = enter(policy, env, seed, render_mode="rgb_array")
         try:
             _aim(world, size)
             rate = float(world.env.metadata.get("render_fps") or 30)
@@ -90,27 +90,6 @@ def _no_gl() -> UsageError:
     return UsageError(
         f"video: no OpenGL to draw with (MUJOCO_GL={backend}); MUJOCO_GL=egl needs `{INSTALL}`"
     )
-
-
-def _enter(policy: Policy, env: str | None, seed: int) -> Environment:
-    """The policy's task or the given one, in a mode that draws."""
-    name = env or policy.about.get("env")
-    if name is None:
-        raise UsageError("env: none given and the policy names none")
-    if env is None and ":" in name:
-        raise UsageError(
-            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
-        )
-    kwargs = policy.about.get("env_kwargs", {}) | {"render_mode": "rgb_array"}
-    world = Environment(name, kwargs, seed, Stream.REPORT)
-    world.check()
-    taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
-    if (taken, given) != (world.observation_size, world.action_size):
-        raise UsageError(
-            f"env: {name} has observations of {world.observation_size} and actions of "
-            f"{world.action_size}; the policy takes {taken} and gives {given}"
-        )
-    return world
 
 
 def _aim(world: Environment, size: tuple[int, int]) -> None:

@@ -1,7 +1,7 @@
 """A whole run to a file and back, bit for bit: learners, replay, envs, random streams, counters."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,27 +9,25 @@ import numpy as np
 from pacesetter import storage
 from pacesetter.envs import Snapshot
 from pacesetter.errors import TrainingError, UsageError
-from pacesetter.runs import threads
+from pacesetter.runs import RunDirectory, threads
 from pacesetter.storage import Arrays, Content
+from pacesetter.training.ensemble import Ensemble
 from pacesetter.training.progress import Progress
-
-if TYPE_CHECKING:
-    from pacesetter.training.trainer import Trainer
 
 KIND = "checkpoint"
 SCHEMA = 1
 
 
-def save(trainer: "Trainer") -> None:
+def save(ensemble: Ensemble, directory: RunDirectory) -> None:
     """Write the checkpoint; the one before it stays as previous.safetensors."""
     arrays = {
-        **_flatten("states", trainer.states),
-        **_flatten("memory", trainer.memory),
-        "normalizer": trainer.normalizer.sums,
+        **_flatten("states", ensemble.states),
+        **_flatten("memory", ensemble.memory),
+        "normalizer": ensemble.normalizer.sums,
     }
-    _refuse_faults(arrays, trainer.progress.step)
+    _refuse_faults(arrays, ensemble.progress.step)
     episodes: list[int] = []
-    for index, env in enumerate(trainer.envs):
+    for index, env in enumerate(ensemble.envs):
         snapshot = env.snapshot()
         episodes.append(snapshot.episode)
         arrays[f"env.{index}.actions"] = snapshot.actions
@@ -37,24 +35,22 @@ def save(trainer: "Trainer") -> None:
     table = {
         "schema": SCHEMA,
         "threads": threads(),
-        "progress": trainer.progress.table(),
-        "streams": [rng.bit_generator.state for rng in trainer.streams],
+        "progress": ensemble.progress.table(),
+        "streams": [rng.bit_generator.state for rng in ensemble.streams],
         "episodes": episodes,
-        "replays": [replay.commit() for replay in trainer.replays],
-        "log": trainer.directory.log_size(),
+        "replays": [replay.commit() for replay in ensemble.replays],
+        "log": directory.log_size(),
     }
-    directory = trainer.directory
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
 
 
-def restore(trainer: "Trainer") -> list[str]:
+def restore(ensemble: Ensemble, directory: RunDirectory) -> list[str]:
     """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
     notes: list[str] = []
-    directory = trainer.directory
     files = [directory.state_file, directory.previous_file]
     for file in (file for file in files if file.exists()):
         try:
-            _restore(trainer, file, notes)
+            _restore(ensemble, directory, file, notes)
         except UsageError as error:
             notes.append(f"{error}; trying the checkpoint before it")
             continue
@@ -66,27 +62,28 @@ def restore(trainer: "Trainer") -> list[str]:
     return ["no checkpoint yet, starting from the beginning"]
 
 
-def _restore(trainer: "Trainer", file: Path, notes: list[str]) -> None:
+def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: list[str]) -> None:
     arrays, table = storage.read(file, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
             f"{file}: checkpoint schema {table.get('schema')}, this version reads {SCHEMA}"
         )
     try:
-        states = _rebuild("states", trainer.states, arrays)
-        memory = _rebuild("memory", trainer.memory, arrays)
-        for replay, part in zip(trainer.replays, table["replays"], strict=True):
+        states = jax.tree.map(jax.numpy.array, _rebuild("states", ensemble.states, arrays))
+        memory = _rebuild("memory", ensemble.memory, arrays)
+        for replay, part in zip(ensemble.replays, table["replays"], strict=True):
             replay.restore(part)
-        trainer.progress = Progress.load(table["progress"])
-        trainer.normalizer.sums = arrays["normalizer"]
-        for rng, state in zip(trainer.streams, table["streams"], strict=True):
+        ensemble.progress = Progress.load(table["progress"])
+        ensemble.normalizer.sums = arrays["normalizer"]
+        for rng, state in zip(ensemble.streams, table["streams"], strict=True):
             rng.bit_generator.state = state
-        _enter_episodes(trainer, table["episodes"], arrays, notes)
+        _enter_episodes(ensemble, table["episodes"], arrays, notes)
     except (KeyError, ValueError, TypeError) as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
-    trainer.states, trainer.memory = states, memory
-    trainer.directory.cut_log(int(table["log"]))
-    if table["threads"] != threads():
+    ensemble.states, ensemble.memory = states, memory
+    ensemble.acting = ensemble.population.acting(states)
+    directory.cut_log(int(table["log"]))
+    if table["threads"] != threads() and ensemble.progress.step < ensemble.budget:
         notes.append(
             f"made with {table['threads']} threads, going on with {threads()}: "
             "results will differ in their last bits"
@@ -94,13 +91,13 @@ def _restore(trainer: "Trainer", file: Path, notes: list[str]) -> None:
 
 
 def _enter_episodes(
-    trainer: "Trainer", episodes: list[int], arrays: Arrays, notes: list[str]
+    ensemble: Ensemble, episodes: list[int], arrays: Arrays, notes: list[str]
 ) -> None:
-    for index, (env, episode) in enumerate(zip(trainer.envs, episodes, strict=True)):
+    for index, (env, episode) in enumerate(zip(ensemble.envs, episodes, strict=True)):
         actions, observation = (
             arrays[f"env.{index}.{part}"] for part in ("actions", "observation")
         )
-        member = trainer.progress.members[index]
+        member = ensemble.progress.members[index]
         if member.starting:
             env.episode = episode
         elif not env.restore(Snapshot(episode, actions, observation)):
@@ -122,7 +119,7 @@ def _rebuild(prefix: str, like: Any, arrays: Arrays) -> Any:
         array = arrays[_name(prefix, path)]
         if array.shape != leaf.shape or array.dtype != leaf.dtype:
             raise ValueError(f"{_name(prefix, path)} is {array.shape}, expected {leaf.shape}")
-        found.append(jax.numpy.array(array))
+        found.append(array)
     return jax.tree.unflatten(structure, found)
 
 

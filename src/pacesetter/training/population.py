@@ -6,13 +6,13 @@ nobody's stream and no state ever holds one.
 
 from enum import IntEnum
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pacesetter.algorithm import Algorithm, Array, Memory, State
+from pacesetter.algorithm import Algorithm, Array, State
 from pacesetter.policy import OBSERVATION_LIMIT, Floats
 from pacesetter.rules import Parents
 from pacesetter.training.normalizer import Statistics
@@ -23,9 +23,16 @@ class Draw(IntEnum):
     """What a key is for."""
 
     INIT = 0
-    BEGIN = 1
-    ACT = 2
-    UPDATE = 3
+    UPDATE = 1
+
+
+class Cycle(NamedTuple):
+    """What a cycle of the ready members gave."""
+
+    states: State  # of all members
+    losses: Floats  # (ready, losses)
+    error: Floats  # (ready, U, B)
+    acting: list[Any]  # what each ready member acts with now
 
 
 class Population:
@@ -43,8 +50,7 @@ class Population:
         self.normalize = normalize
         self.key = jax.random.key(seed)
         self._init = jax.jit(self._init_all)
-        self._begin = jax.jit(self._begin_all)
-        self._act = jax.jit(self._act_all)
+        self._acting = jax.jit(algorithm.acting)
         self._update = jax.jit(self._update_all, donate_argnums=0)
         self._update_one = jax.jit(self._update_single, donate_argnums=0)
         self._inherit = jax.jit(inherit, static_argnums=2)
@@ -54,24 +60,9 @@ class Population:
         members = jnp.zeros(self.members, int) if same else jnp.arange(self.members)
         return self._init(self.key, members)
 
-    def new_memory(self, states: State) -> Memory:
-        """Empty memories, all to be begun."""
-        shapes = jax.eval_shape(self._begin_new, states, self.key, 0)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def begin(self, states: State, memory: Memory, starting: list[int], tick: int) -> Memory:
-        """Memories with those of the starting members made anew."""
-        if not jax.tree.leaves(memory):
-            return memory
-        mask = np.isin(np.arange(self.members), starting)
-        return self._begin(states, memory, mask, self.key, tick)
-
-    def act(
-        self, states: State, memory: Memory, observations: Floats, statistics: Statistics, tick: int
-    ) -> tuple[Floats, Memory]:
-        """Exploring actions (K, A) in [-1, 1]."""
-        actions, memory = self._act(states, memory, observations, statistics, self.key, tick)
-        return np.asarray(actions), memory
+    def acting(self, states: State) -> list[Any]:
+        """What each member acts with, as NumPy copies."""
+        return self._each(self._acting(states))
 
     def update(
         self,
@@ -81,15 +72,16 @@ class Population:
         weight: Floats | None,
         statistics: Statistics,
         tick: int,
-    ) -> tuple[State, Floats, Floats]:
+    ) -> Cycle:
         """One cycle of each ready member on its own rows (ready, U, B, width).
 
         All members at once, or one after the other: two programs, compiled once, for any K.
-        Gives the states, losses (ready, losses) and errors (ready, U, B).
         """
         if len(ready) == self.members:
-            states, losses, error = self._update(states, rows, weight, statistics, self.key, tick)
-            return states, np.asarray(losses), np.asarray(error)
+            states, losses, error, acting = self._update(
+                states, rows, weight, statistics, self.key, tick
+            )
+            return Cycle(states, np.asarray(losses), np.asarray(error), self._each(acting))
         parts: list[Any] = []
         for place, member in enumerate(ready):
             weights = None if weight is None else weight[place]
@@ -97,8 +89,13 @@ class Population:
                 states, member, rows[place], weights, statistics, self.key, tick
             )
             parts.append(part)
-        losses, errors = zip(*parts, strict=True)
-        return states, np.stack(losses), np.stack(errors)
+        losses, errors, acting = zip(*parts, strict=True)
+        return Cycle(
+            states,
+            np.stack(losses),
+            np.stack(errors),
+            [jax.tree.map(np.asarray, part) for part in acting],
+        )
 
     def inherit(self, states: State, parents: Parents, copy: str) -> State:
         """States in which each member starts again from its parent."""
@@ -123,31 +120,6 @@ class Population:
     def _init_all(self, key: Array, members: Array) -> State:
         return jax.vmap(self.algorithm.init)(_keys(key, Draw.INIT, 0, members))
 
-    def _begin_new(self, states: State, key: Array, tick: int) -> Memory:
-        return jax.vmap(self.algorithm.begin)(states, self._all_keys(key, Draw.BEGIN, tick))
-
-    def _begin_all(
-        self, states: State, memory: Memory, mask: Array, key: Array, tick: int
-    ) -> Memory:
-        def choose(new: Array, old: Array) -> Array:
-            return jnp.where(_column(mask, new), new, old)
-
-        return jax.tree.map(choose, self._begin_new(states, key, tick), memory)
-
-    def _act_all(
-        self,
-        states: State,
-        memory: Memory,
-        observations: Array,
-        statistics: Any,
-        key: Array,
-        tick: int,
-    ) -> tuple[Array, Memory]:
-        keys = self._all_keys(key, Draw.ACT, tick)
-        return jax.vmap(self.algorithm.act)(
-            states, memory, self._scale(observations, statistics), keys
-        )
-
     def _update_all(
         self,
         states: State,
@@ -156,13 +128,13 @@ class Population:
         statistics: Any,
         key: Array,
         tick: int,
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[State, Array, Array, Any]:
         keys = self._all_keys(key, Draw.UPDATE, tick)
         update = jax.vmap(self.algorithm.update)(
             states, self._batch(rows, weight, statistics), keys
         )
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)], axis=-1)
-        return update.state, losses, update.error
+        return update.state, losses, update.error, self._apart(update.state)
 
     def _update_single(
         self,
@@ -173,13 +145,21 @@ class Population:
         statistics: Any,
         key: Array,
         tick: int,
-    ) -> tuple[State, Array, Array]:
+    ) -> tuple[State, Array, Array, Any]:
         state = jax.tree.map(lambda x: x[member], states)
         batch = self._batch(rows, weight, statistics)
         update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, tick, member))
         states = jax.tree.map(lambda all, one: all.at[member].set(one), states, update.state)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
-        return states, losses, update.error
+        return states, losses, update.error, self._apart(update.state)
+
+    def _apart(self, state: State) -> Any:
+        """Buffers of their own: a state that NumPy looks into cannot be donated without a copy."""
+        return jax.tree.map(jnp.copy, self.algorithm.acting(state))
+
+    def _each(self, acting: Any) -> list[Any]:
+        arrays = jax.tree.map(np.asarray, acting)
+        return [jax.tree.map(lambda x, k=k: x[k], arrays) for k in range(self.members)]
 
     def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
         batch = self.columns.unpack(rows, weight)

@@ -21,6 +21,23 @@ class Member:
     episode_length: int = 0
     window: list[float] = field(default_factory=list[float])  # returns since the last selection
 
+    def start(self, step: int) -> None:
+        """Enter an episode at a step of the run."""
+        self.starting, self.active, self.started = False, True, step
+        self.episode_return, self.episode_length = 0.0, 0
+
+    def step(self, reward: float) -> None:
+        """Count one env step."""
+        self.steps += 1
+        self.episode_length += 1
+        self.episode_return += reward
+
+    def end(self, counts: bool) -> None:
+        """End the episode and wait; its return counts in a selection if it was no warm-up."""
+        self.active = False
+        if counts:
+            self.window.append(self.episode_return)
+
 
 @dataclass
 class Progress:
@@ -42,7 +59,8 @@ class Progress:
     next_train: int = TRAIN_ROW_EVERY
     best: float | None = None
     finished: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
-    losses: list[list[float]] = field(default_factory=list[list[float]])  # sum and count, a member
+    losses: list[float] = field(default_factory=list[float])  # sums since the last row
+    updated: int = 0  # how many losses were summed
     wall_seconds: float = 0.0
     cpu_seconds: float = 0.0
 
@@ -66,6 +84,20 @@ class Progress:
 
     def table(self) -> dict[str, Any]:
         return asdict(self)
+
+    def note(self, losses: Any) -> None:
+        """Add losses (members, losses) to what the next row averages."""
+        sums = losses.sum(axis=0, dtype=float).tolist()
+        self.losses = [a + b for a, b in zip(self.losses or [0.0] * len(sums), sums, strict=True)]
+        self.updated += len(losses)
+
+    def training_values(self, loss_names: list[str]) -> dict[str, Any]:
+        """Episodes ended as [member, return, length] and mean losses since the last row."""
+        means = [total / self.updated for total in self.losses]
+        values: dict[str, Any] = {"episodes_ended": self.finished}
+        values |= dict(zip(loss_names, means, strict=False))  # no losses before the first update
+        self.finished, self.losses, self.updated = [], [], 0
+        return values
 
     def ledger(self) -> dict[str, Any]:
         """What the run has spent."""

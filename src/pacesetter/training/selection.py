@@ -1,6 +1,6 @@
-"""How sure a selection was: the gap between members and the standard error of that gap."""
+"""One selection and how sure it was: the gap between members and the standard error of that gap."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,20 +8,23 @@ from numpy.typing import NDArray
 REMEMBERED = 20
 
 
-@dataclass(frozen=True)
-class Gap:
-    """Best mean return minus the next, and the standard error of such a difference."""
+class Selection(NamedTuple):
+    """Who starts again from whom, and on what grounds; returns are (K, episodes)."""
 
+    parents: list[int]
+    champion: int
+    returns: list[list[float]]
     gap: float
     standard_error: float
 
 
-def measure(returns: NDArray[np.float64], deviations: list[float]) -> Gap:
-    """The gap of one selection from returns (K, n); adds to `deviations`, the last 20 variances.
+def measure(returns: NDArray[np.float64], deviations: list[float]) -> tuple[float, float]:
+    """Best mean return minus the next, and the standard error of such a difference.
 
     With n > 1 episodes a member, the variance is that of a member's own episodes. With one, it is
-    that between the members, pooled over the last selections: after a copy they are clones, so
-    their spread is noise, and if they are not, the error is overstated.
+    that between the members: after a copy they are clones, so their spread is noise, and where
+    they are not, the error is overstated. Either is pooled over the last 20 selections, which
+    `deviations` remembers.
     """
     episodes = returns.shape[1]
     means = np.sort(returns.mean(axis=1))
@@ -29,4 +32,4 @@ def measure(returns: NDArray[np.float64], deviations: list[float]) -> Gap:
     deviations.append(float(spread))
     del deviations[:-REMEMBERED]
     error = float(np.sqrt(2 * np.mean(deviations) / episodes))
-    return Gap(float(means[-1] - means[-2]), error)
+    return float(means[-1] - means[-2]), error

@@ -70,21 +70,42 @@ def evaluate(
     """
     if episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
+    world = enter(policy, env, seed, env_kwargs)
+    try:
+        return rollouts(_acting(policy, world, noise, seed), world, episodes)
+    finally:
+        world.close()
+
+
+def enter(
+    policy: Policy | None,
+    env: str | None,
+    seed: int,
+    env_kwargs: dict[str, Any] | None = None,
+    **extra: Any,
+) -> Environment:
+    """The given task or the policy's own, checked against the policy; `extra` goes to its maker."""
     about = policy.about if policy else {}
     name = env or about.get("env")
-    if name is None:
+    if not isinstance(name, str):
         raise UsageError("env: none given and the policy names none")
     if env is None and ":" in name:
         raise UsageError(
             f"env: the file names '{name}', which imports a module; allow it with --env {name}"
         )
-    kwargs = about.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
-    world = Environment(name, kwargs, seed, Stream.REPORT)
+    own = about.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
+    world = Environment(name, own | extra, seed, Stream.REPORT)
     world.check()
-    try:
-        return rollouts(_acting(policy, world, noise, seed), world, episodes)
-    finally:
-        world.close()
+    if policy is not None:
+        taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+        if (taken, given) != (world.observation_size, world.action_size):
+            raise UsageError(
+                f"env: {name} has observations of {world.observation_size} and actions of "
+                f"{world.action_size}; the policy takes {taken} and gives {given}"
+            )
+        if not (np.array_equal(policy.low, world.low) and np.array_equal(policy.high, world.high)):
+            raise UsageError(f"env: {name} has other action bounds than the policy")
+    return world
 
 
 def _acting(policy: Policy | None, env: Environment, noise: float, seed: int) -> Act:
@@ -92,13 +113,6 @@ def _acting(policy: Policy | None, env: Environment, noise: float, seed: int) ->
     size = env.action_size
     if policy is None:
         return lambda observation: rng.uniform(-1, 1, size).astype(np.float32)
-    if (taken := policy.actors[0][0]["kernel"].shape[0]) != env.observation_size or len(
-        policy.low
-    ) != size:
-        raise UsageError(
-            f"env: {env.name} has observations of {env.observation_size} and actions of {size}; "
-            f"the policy takes {taken} and gives {len(policy.low)}"
-        )
     if noise == 0:
         return policy.act
     return lambda observation: (policy.act(observation) + noise * rng.normal(size=size)).astype(
