@@ -45,22 +45,24 @@ class Update(NamedTuple):
     error: Array  # (U, B) absolute errors, which a prioritised replay takes as feedback
 
 
+NO_MASK: Floats = np.zeros(0, np.float32)
+
+
 class Algorithm(Protocol):
     """One member's learner: pure functions, no env, no files. The trainer alone lifts it to K.
 
-    A state is a NamedTuple; the fields named `*_optimizer` and `updates` are its optimiser, and
-    `actor` with `target_actor` its policy, which is all that a partial copy needs to know. It never
-    holds a random key: clones that shared one would stay equal for ever.
+    A state is a NamedTuple. At its top, fields named `*_optimizer` and `updates` are its optimiser,
+    and `actor` with `target_actor` its policy, which is all that a partial copy needs to know. It
+    never holds a random key: clones that shared one would stay equal for ever.
     """
 
     @property
-    def masks(self) -> int:
-        """Bootstrap columns N of a replay row."""
+    def cycle(self) -> int:
+        """U, the critic updates of one call of `update`; 1 for a rollout."""
         ...
 
-    @property
-    def cycle(self) -> int:
-        """U, the critic updates of one call of `update`."""
+    def mask(self, rng: np.random.Generator) -> Floats:
+        """Bootstrap mask (N,) that is stored with a new row; N may be 0."""
         ...
 
     def init(self, key: Array) -> State:
@@ -78,9 +80,10 @@ class Algorithm(Protocol):
     def act(
         self, acting: Any, memory: Memory, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Memory]:
-        """Exploring action (A,) in [-1, 1] for one observation (O,).
+        """Exploring action (A,) for one observation (O,); the trainer cuts it at +-1 for the env.
 
-        In NumPy: for one observation that is several times faster than calling into JAX.
+        The replay stores it cut, a rollout as it is, so that its probability can be computed. In
+        NumPy: for one observation that is several times faster than calling into JAX.
         """
         ...
 

@@ -116,12 +116,13 @@ def evaluate(words: list[str]) -> int:
     command.add_argument("--json", action="store_true", help="print all returns as JSON")
     command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
     found = command.parse(words)
-    is_file = found.run.endswith(".safetensors")
-    path = Path(found.run) if is_file else find(found.run, found.runs).policy_file
+    path, env = Path(found.run), found.env
+    if path.suffix != ".safetensors":
+        run = find(found.run, found.runs)
+        path, env = run.policy_file, env or run.settings()["env"]
     policy = load(path)
-    env = found.env or (None if is_file else policy.about["env"])
     result = evaluate(policy, env, found.episodes, found.seed, noise=found.noise)
-    about = {"env": env or policy.about["env"], "seed": found.seed, "noise": found.noise}
+    about = {"env": env or policy.about.get("env"), "seed": found.seed, "noise": found.noise}
     if found.json:
         print(json.dumps({**result.table(), **about, "policy": str(path)}))
     else:

@@ -8,11 +8,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
 from pacesetter.errors import UsageError, unknown
+from pacesetter.rules import RULES
 
 Settings = dict[str, Any]
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -25,6 +26,8 @@ def _count(value: object) -> object:
     if found is None:
         raise ValueError("is not a count; write 5000, 300k, 1M or 1e6")
     number = float(found[1]) * _MULTIPLES[found[2]]
+    if number > 1e15:
+        raise ValueError("is too large")
     if number != int(number):
         raise ValueError("is not a whole number")
     return int(number)
@@ -37,6 +40,13 @@ def _duration(value: object) -> object:
     return value if found is None else float(found[1]) * _SECONDS[found[2]]
 
 
+def _rule(value: str) -> str:
+    if value not in RULES:
+        raise unknown("rule", value, RULES)
+    return value
+
+
+Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
 Duration = Annotated[float, BeforeValidator(_duration)]
 
@@ -56,6 +66,7 @@ class OffPolicy(Hyper):
     batch_size: int = Field(256, ge=1, description="transitions in a minibatch")
     replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
     warmup: Count = Field(25_000, ge=0, description="first steps of all members, uniform actions")
+    warmup_updates: bool = Field(False, description="update during the warm-up too")
     updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
     update_at: Literal["step", "episode"] = Field(
         "step", description="as they fall due, or all at the episode's end"
@@ -69,13 +80,13 @@ class Run:
     algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
     env_kwargs: dict[str, Any] = Field(default_factory=dict, description="given to gymnasium.make")
-    name: str = Field(pattern=r"^[\w.-]+$", description="folder of the run below its env")
+    name: str = Field(pattern=r"^\w[\w.-]*$", description="folder of the run below its env")
     steps: Count = Field(1_000_000, ge=1, description="env steps of all members together")
     time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
-    seed: int = Field(0, ge=0, description="every random stream follows from it")
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="every random stream follows from it")
     members: int = Field(1, ge=1, le=1000, description="learners that share the replay")
-    rule: Literal["none", "best", "random", "top_half", "tournament"] = Field(
-        "best", description="which member the others start again from"
+    rule: Annotated[str, AfterValidator(_rule)] = Field(
+        "best", description="who starts again from whom; see `pacesetter list rules`"
     )
     select_on: Literal["train", "eval"] = Field(
         "train", description="returns of training episodes, or of extra noise-free ones (counted)"
@@ -87,7 +98,7 @@ class Run:
     )
     same_init: bool = Field(False, description="members start from the same weights")
     count: Literal["all", "member"] = Field(
-        "all", description="budget and clocks count all members' steps, or each member's own"
+        "all", description="`--steps` and clocks count all members' steps, or the mean member's"
     )
     wait: bool = Field(True, description="a member whose episode ended waits for the others")
     replay_scope: Literal["shared", "member"] = Field(
@@ -149,7 +160,9 @@ def read_file(path: Path) -> Settings:
         raise UsageError(f"config: cannot read {path}: {error}") from None
     if not isinstance(table, dict):
         raise UsageError(f"config: {path} holds no table of settings")
-    found: Settings = table.get("settings", table)
+    found: Any = table.get("settings", table)
+    if not isinstance(found, dict):
+        raise UsageError(f"config: settings in {path} must be a table")
     return {key.replace("-", "_"): value for key, value in found.items()}
 
 

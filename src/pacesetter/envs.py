@@ -4,6 +4,7 @@ import difflib
 import logging
 import re
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -62,8 +63,11 @@ class Snapshot(NamedTuple):
 
 def known() -> list[str]:
     """Ids that `make` accepts without a module, less those whose entry point only raises."""
-    registered = gymnasium.registry.items()
-    return [name for name, spec in registered if isinstance(spec.entry_point, str)]
+
+    def works(entry_point: object) -> bool:
+        return not getattr(entry_point, "__name__", "").startswith("_raise_")
+
+    return [name for name, spec in gymnasium.registry.items() if works(spec.entry_point)]
 
 
 def _log_warning(message: str) -> None:
@@ -85,7 +89,7 @@ def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
 def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
     """A task by its Gymnasium id, or one line that says what is wrong with the id or the task."""
     plain = name.split(":")[-1]
-    if not re.search(r"-v\d+$", plain):
+    if not re.search(r"-v\d+$", plain) and name not in known():
         versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
         hint = f"; write {' or '.join(versions)}" if versions else "; such as HalfCheetah-v5"
         raise UsageError(f"env: '{name}' has no version{hint}")
@@ -147,7 +151,7 @@ class Environment:
         self.episode = self.episode + 1 if episode is None else episode
         self.actions = []
         seed = episode_seed(self.seed, self.stream, self.index, self.episode)
-        result: Any = self.env.reset(seed=seed)
+        result: Any = self._call("reset", lambda: self.env.reset(seed=seed))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._broken("reset", "must return (observation, info)")
         self.observation = self._observation(result[0])
@@ -157,7 +161,8 @@ class Environment:
         """One step with an action (A,) in [-1, 1]."""
         self.actions.append(action)
         scaled = to_env(action, self.low, self.high)
-        result: Any = self.env.step(scaled.reshape(self.action_shape).astype(self.action_type))
+        scaled = scaled.reshape(self.action_shape).astype(self.action_type)
+        result: Any = self._call("step", lambda: self.env.step(scaled))
         if not (isinstance(result, tuple) and len(result) == 5):
             raise self._broken(
                 "step", "must return (observation, reward, terminated, truncated, info)"
@@ -170,6 +175,8 @@ class Environment:
         for what, flag in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(flag, (bool, np.bool_)):
                 raise self._broken(what, f"must be a bool, it is {flag!r}")
+        if not isinstance(info, dict):
+            raise self._broken("info", f"must be a dict, it is {info!r}")
         self.observation = self._observation(observation)
         return Step(self.observation, float(reward), bool(terminated), bool(truncated), info)
 
@@ -180,8 +187,6 @@ class Environment:
             self.step(np.zeros(self.action_size, np.float32))
         except TrainingError as error:
             raise UsageError(f"env: {error}") from None
-        except Exception as error:
-            raise UsageError(f"env: {self.name}: fails at its first step: {error}") from None
         self.episode = -1
 
     def snapshot(self) -> Snapshot:
@@ -202,6 +207,12 @@ class Environment:
 
     def close(self) -> None:
         self.env.close()
+
+    def _call(self, what: str, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except Exception as error:
+            raise self._broken(what, f"failed: {type(error).__name__}: {error}") from error
 
     def _observation(self, observation: Any) -> Floats:
         try:

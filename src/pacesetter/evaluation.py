@@ -48,7 +48,7 @@ def rollouts(
             total += step.reward
             length += 1
             for name, value in step.info.items():
-                if name.startswith("reward_") and np.ndim(value) == 0:
+                if name.startswith("reward_") and isinstance(value, (int, float, np.number)):
                     terms[name] = terms.get(name, 0.0) + float(value) / episodes
         returns.append(total)
         lengths.append(length)
@@ -93,7 +93,9 @@ def enter(
         raise UsageError(
             f"env: the file names '{name}', which imports a module; allow it with --env {name}"
         )
-    own = about.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
+    own = env_kwargs
+    if own is None:
+        own = about.get("env_kwargs", {}) if name == about.get("env") else {}
     world = Environment(name, own | extra, seed, Stream.REPORT)
     world.check()
     if policy is not None:

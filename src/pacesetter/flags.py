@@ -75,10 +75,13 @@ def split_env_kwargs(arguments: list[str]) -> tuple[list[str], Settings]:
 
 
 def _value(text: str) -> Any:
+    if text.lower() in ("true", "false", "none"):
+        return {"true": True, "false": False, "none": None}[text.lower()]
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+    return value if isinstance(value, (int, float, str, list)) else text
 
 
 def _allowed(info: Any) -> list[str]:

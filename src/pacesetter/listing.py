@@ -5,6 +5,7 @@ from typing import Any
 
 from tabulate import tabulate
 
+from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
 
 SHOWN_EVALUATIONS = 5
@@ -49,7 +50,11 @@ def runs(folder: str) -> list[str]:
     """Runs below a folder: how far each is and how its champion does."""
     rows: list[tuple[Any, ...]] = []
     for run in find_all(folder):
-        step, budget, result = _state(run)
+        try:
+            step, budget, result = _state(run)
+        except UsageError as error:
+            rows.append((run.path, "-", str(error), "-"))
+            continue
         rows.append((run.path, f"{step:,} of {budget:,}", _status(run, step, budget), result))
     if not rows:
         return [f"no runs below {folder}"]

@@ -140,13 +140,40 @@ def load(path: str | Path) -> Policy:
             normalizer=(arrays["mean"], arrays["deviation"]) if "mean" in arrays else None,
             about=dict(table["about"]),
         )
-        if not all(np.isfinite(array).all() for array in arrays.values()):
-            raise ValueError("holds a number that is not finite")
-        if policy.act(np.zeros(policy.actors[0][0]["kernel"].shape[0])).shape != policy.low.shape:
-            raise ValueError("its last layer does not fit its bounds")
-    except (KeyError, ValueError, IndexError, TypeError, AttributeError) as error:
+        _check(policy, arrays)
+    except storage.FAULTS as error:
         raise UsageError(f"{path}: damaged policy: {error}") from None
     return policy
+
+
+def _check(policy: Policy, arrays: storage.Arrays) -> None:
+    """Refuse shapes that do not fit each other, before they are computed with."""
+    about = policy.about
+    kinds = {"env": str, "env_kwargs": dict, "step": int}
+    for name, kind in kinds.items():
+        if not isinstance(about.get(name, kind()), kind):
+            raise ValueError(f"{name} must be a {kind.__name__}")
+    for name, array in arrays.items():
+        if array.dtype != np.float32 or array.size == 0 or not np.isfinite(array).all():
+            raise ValueError(f"{name} must hold finite float32 numbers")
+    inputs = policy.actors[0][0]["kernel"].shape[0]
+    for layers in policy.actors:
+        size = inputs
+        for layer in layers:
+            shape = layer["kernel"].shape
+            if len(shape) != 2 or shape[0] != size:
+                raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")
+            size = shape[1]
+            if any(x.shape != (size,) for name, x in layer.items() if name != "kernel"):
+                raise ValueError("a layer's bias or norm does not fit it")
+        if policy.low.shape != (size,) or policy.high.shape != (size,):
+            raise ValueError("its last layer does not fit its bounds")
+    if not (policy.low <= policy.high).all():
+        raise ValueError("its bounds are exchanged")
+    if policy.normalizer is not None:
+        mean, deviation = policy.normalizer
+        if mean.shape != (inputs,) or deviation.shape != (inputs,) or not (deviation > 0).all():
+            raise ValueError("its normaliser does not fit")
 
 
 def _one_of(word: str, options: Any) -> str:

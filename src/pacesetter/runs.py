@@ -10,7 +10,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import version
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,7 @@ class RunDirectory:
         self.best_file = path / "best.safetensors"
         self.state_file = path / "last" / "state.safetensors"
         self.previous_file = path / "last" / "previous.safetensors"
-        self._lock: int | None = None
+        self._lock: TextIOWrapper | None = None
 
     @classmethod
     def of(cls, runs: str | Path, config: Config) -> "RunDirectory":
@@ -61,13 +63,28 @@ class RunDirectory:
         try:
             self.state_file.parent.mkdir(parents=True, exist_ok=True)
             self.lock()
-            self.write_config(config)
+            self.refuse_existing(config)  # another process may have been quicker
+            table = {"schema": SCHEMA, "settings": config.settings(), **provenance()}
+            self._write_config(table)
         except OSError as error:
             raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
 
-    def write_config(self, config: Config) -> None:
-        """Write settings, command line, versions, commit and thread count."""
-        table = {"schema": SCHEMA, "settings": config.settings(), **provenance()}
+    def note_resume(self, config: Config, step: int) -> None:
+        """Add to the config that, and with what, a run was resumed; its budget may be new."""
+        table = self.record()
+        resumed = [*table.get("resumed", []), {"step": step, **provenance()}]
+        self._write_config(table | {"settings": config.settings(), "resumed": resumed})
+
+    def remove(self) -> None:
+        """Undo `create` for a run that cannot start."""
+        self.unlock()
+        shutil.rmtree(self.path)
+        for folder in list(self.path.parents)[:3]:
+            if any(folder.iterdir()):
+                break
+            folder.rmdir()
+
+    def _write_config(self, table: Row) -> None:
         write_atomically(self.config_file, (json.dumps(table, indent=1) + "\n").encode())
 
     def record(self) -> Row:
@@ -113,12 +130,19 @@ class RunDirectory:
         """Bytes of the log."""
         return self.metrics_file.stat().st_size if self.metrics_file.exists() else 0
 
-    def cut_log(self, size: int) -> None:
-        """Cut the log back to what a checkpoint covers."""
-        if self.log_size() < size:
-            raise UsageError(f"{self.metrics_file}: damaged: shorter than its checkpoint says")
+    def sync_log(self) -> int:
+        """Put the log on disk; its size in bytes."""
+        if not self.metrics_file.exists():
+            return 0
+        with self.metrics_file.open("a") as file:
+            os.fsync(file.fileno())
+            return file.tell()
+
+    def cut_log(self, size: int) -> bool:
+        """Cut the log back to what a checkpoint covers; False if rows are missing."""
         if self.metrics_file.exists():
-            os.truncate(self.metrics_file, size)
+            os.truncate(self.metrics_file, min(size, self.log_size()))
+        return self.log_size() == size
 
     def sweep(self) -> None:
         """Remove what a killed write left behind."""
@@ -128,30 +152,33 @@ class RunDirectory:
 
     def lock(self) -> None:
         """Hold the folder until `unlock` or the process ends; refuse a second holder."""
-        file = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            file = (self.path / "lock").open("a+")
+        except OSError as error:
+            raise UsageError(f"run: cannot write {self.path}: {error.strerror}") from None
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            holder = os.read(file, 200).decode(errors="replace").strip()
-            os.close(file)
-            raise UsageError(
-                f"run: {self.path} is in use by {holder or 'another process'}"
-            ) from None
-        os.truncate(file, 0)
-        os.write(file, f"process {os.getpid()} on {platform.node()}\n".encode())
+            file.seek(0)
+            holder = file.read(200).strip() or "another process"
+            file.close()
+            raise UsageError(f"run: {self.path} is in use by {holder}") from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}\n")
+        file.flush()
         self._lock = file
 
     def unlock(self) -> None:
         """Let another process have the folder."""
         if self._lock is not None:
-            os.close(self._lock)
+            self._lock.close()
             self._lock = None
 
     def in_use(self) -> bool:
         """Whether a process holds the folder now."""
         try:
             with (self.path / "lock").open() as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except FileNotFoundError:
             return False
         except OSError:
@@ -170,6 +197,7 @@ def provenance() -> Row:
     }
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide results."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}

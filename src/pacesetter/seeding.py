@@ -16,6 +16,7 @@ class Stream(IntEnum):
     SAMPLE = 5
     RULE = 6
     ACT = 7
+    MASK = 8
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
@@ -24,10 +25,11 @@ def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
 
 
 def episode_seed(seed: int, stream: Stream, index: int, episode: int) -> int:
-    """Seed of one episode's `reset`; its low bits are the stream, so streams never share a start.
+    """Seed of one episode's `reset`; its low bits are the stream, so streams never share a start;
+    it has 32 bits, which is all that older generators take.
 
     An episode that is seeded by its number can be entered again at any time, which is what makes
     a resumed run exact.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, index, episode))
-    return int(sequence.generate_state(1)[0]) << 3 | stream
+    return int(sequence.generate_state(1)[0]) >> 3 << 3 | stream

@@ -15,7 +15,20 @@ from safetensors.numpy import load, save
 from pacesetter.errors import UsageError
 
 Arrays = dict[str, NDArray[Any]]
-TEMPORARY = ".tmp"
+TEMPORARY = ".pacesetter-tmp"
+
+
+# What reading a hostile file may raise besides UsageError.
+FAULTS = (
+    SafetensorError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+    MemoryError,
+)
 
 
 class Content(NamedTuple):
@@ -41,8 +54,10 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
         file.flush()
         os.fsync(file.fileno())
     if keep is not None and path.exists():
-        keep.unlink(missing_ok=True)
-        os.link(path, keep)
+        other = keep.with_name(keep.name + TEMPORARY)
+        other.unlink(missing_ok=True)
+        os.link(path, other)
+        other.replace(keep)
     temporary.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -85,7 +100,7 @@ def read(path: Path, kind: str) -> Content:
         raise UsageError(f"{path}: no such file") from None
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
-    except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except FAULTS as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UsageError(f"{path}: damaged or foreign: {reason}") from None
 

@@ -52,5 +52,5 @@ def find(name: str) -> Kind:
             return Kind(module.Hyper, module.build)
         found_class = getattr(module, attribute)
         return Kind(found_class.Hyper, found_class)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:
         raise UsageError(f"algorithm: cannot load '{target}': {error}") from None

@@ -20,8 +20,8 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import nets
-from pacesetter.algorithm import Array, Batch, Spec, Update
-from pacesetter.config import STRICT, Count, OffPolicy
+from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.config import STRICT, Count, OffPolicy, Width
 from pacesetter.policy import Actors, Floats, Layers, clip, forward
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -32,7 +32,9 @@ class Hyper(OffPolicy):
     """Defaults as in the paper's second version; warm-up is uniform, as in Spinning Up."""
 
     warmup: Count = Field(10_000, ge=0, description="first steps of all members, uniform actions")
-    hidden: tuple[int, ...] = Field((256, 256), min_length=1, description="widths of hidden layers")
+    hidden: tuple[Width, ...] = Field(
+        (256, 256), min_length=1, description="widths of hidden layers"
+    )
     actor_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the actor")
     critic_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the critics")
     alpha_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the log temperature")
@@ -63,8 +65,10 @@ class SAC:
 
     spec: Spec
     hyper: Hyper
-    masks: int = 0
     cycle: int = 1
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        return NO_MASK
 
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)

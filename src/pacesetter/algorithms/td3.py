@@ -20,17 +20,21 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import nets
-from pacesetter.algorithm import Array, Batch, Spec, Update
-from pacesetter.config import STRICT, OffPolicy
+from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.config import STRICT, OffPolicy, Width
 from pacesetter.exploration import KINDS
-from pacesetter.policy import Actors, Floats, Layers, clip, forward
+from pacesetter.policy import Actors, Floats, Layers, forward
+
+UNROLLED = 4  # critic steps a loop; without one, XLA need not copy states between iterations
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
 class Hyper(OffPolicy):
     """Defaults are the reference repository's; lengths of noise are in actions of [-1, 1]."""
 
-    hidden: tuple[int, ...] = Field((256, 256), min_length=1, description="widths of hidden layers")
+    hidden: tuple[Width, ...] = Field(
+        (256, 256), min_length=1, description="widths of hidden layers"
+    )
     actor_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the actor")
     critic_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the critics")
     tau: float = Field(0.005, gt=0, le=1, description="share of the network in a target update")
@@ -65,11 +69,13 @@ class TD3:
     action_layer: int = 0
     critic_decay: float = 0.0
     output_bound: float | None = None
-    masks: int = 0
 
     @property
     def cycle(self) -> int:
         return self.hyper.policy_delay
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        return NO_MASK
 
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
@@ -96,7 +102,7 @@ class TD3:
     ) -> tuple[Floats, Any]:
         explore = KINDS[self.hyper.exploration].noise
         noise, memory = explore(memory, self.hyper.exploration_noise, self.spec.action_size, rng)
-        return clip(np.tanh(forward(acting, observation)) + noise), memory
+        return np.tanh(forward(acting, observation)) + noise, memory
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         def critic_step(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:
@@ -106,7 +112,9 @@ class TD3:
             return state, (loss, error)
 
         steps = (batch, jax.random.split(key, self.cycle))
-        state, (losses, error) = jax.lax.scan(critic_step, state, steps, unroll=self.cycle)
+        state, (losses, error) = jax.lax.scan(
+            critic_step, state, steps, unroll=min(self.cycle, UNROLLED)
+        )
         state, actor_loss = self.fit_actor(state, jax.tree.map(lambda x: x[-1], batch))
         return Update(state, {"critic_loss": losses.mean(), "actor_loss": actor_loss}, error)
 

@@ -28,7 +28,9 @@ def save(ensemble: Ensemble, directory: RunDirectory) -> None:
     _refuse_faults(arrays, ensemble.progress.step)
     episodes: list[int] = []
     for index, env in enumerate(ensemble.envs):
-        snapshot = env.snapshot()
+        snapshot, member = env.snapshot(), ensemble.progress.members[index]
+        if member.starting or not member.active:  # its episode is over: only its number counts
+            snapshot = Snapshot(snapshot.episode, snapshot.actions[:0], snapshot.observation * 0)
         episodes.append(snapshot.episode)
         arrays[f"env.{index}.actions"] = snapshot.actions
         arrays[f"env.{index}.observation"] = snapshot.observation
@@ -39,7 +41,8 @@ def save(ensemble: Ensemble, directory: RunDirectory) -> None:
         "streams": [rng.bit_generator.state for rng in ensemble.streams],
         "episodes": episodes,
         "replays": [replay.commit() for replay in ensemble.replays],
-        "log": directory.log_size(),
+        "log": directory.sync_log(),
+        "run": _identity(ensemble),
     }
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
 
@@ -55,6 +58,8 @@ def restore(ensemble: Ensemble, directory: RunDirectory) -> list[str]:
             notes.append(f"{error}; trying the checkpoint before it")
             continue
         return notes
+    if not notes and directory.log_size():
+        notes = [f"{directory.state_file}: is missing"]
     if notes:
         raise UsageError(
             f"{notes[0].split(';')[0]}; no whole checkpoint is left in {directory.path}"
@@ -68,6 +73,8 @@ def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: lis
         raise UsageError(
             f"{file}: checkpoint schema {table.get('schema')}, this version reads {SCHEMA}"
         )
+    if table.get("run") != _identity(ensemble):
+        raise UsageError(f"{file}: is of another run: {table.get('run')}")
     try:
         states = jax.tree.map(jax.numpy.array, _rebuild("states", ensemble.states, arrays))
         memory = _rebuild("memory", ensemble.memory, arrays)
@@ -78,11 +85,12 @@ def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: lis
         for rng, state in zip(ensemble.streams, table["streams"], strict=True):
             rng.bit_generator.state = state
         _enter_episodes(ensemble, table["episodes"], arrays, notes)
-    except (KeyError, ValueError, TypeError) as error:
+    except storage.FAULTS as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
     ensemble.states, ensemble.memory = states, memory
     ensemble.acting = ensemble.population.acting(states)
-    directory.cut_log(int(table["log"]))
+    if not directory.cut_log(int(table["log"])):
+        notes.append(f"{directory.metrics_file}: rows of the log are missing")
     if table["threads"] != threads() and ensemble.progress.step < ensemble.budget:
         notes.append(
             f"made with {table['threads']} threads, going on with {threads()}: "
@@ -98,7 +106,7 @@ def _enter_episodes(
             arrays[f"env.{index}.{part}"] for part in ("actions", "observation")
         )
         member = ensemble.progress.members[index]
-        if member.starting:
+        if member.starting or not member.active:
             env.episode = episode
         elif not env.restore(Snapshot(episode, actions, observation)):
             notes.append(
@@ -127,8 +135,15 @@ def _name(prefix: str, path: Any) -> str:
     return f"{prefix}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
 
 
+def _identity(ensemble: Ensemble) -> dict[str, Any]:
+    run = ensemble.config.run
+    names = ("algorithm", "env", "env_kwargs", "seed", "members")
+    return {name: getattr(run, name) for name in names}
+
+
 def _refuse_faults(arrays: Arrays, step: int) -> None:
     for name, array in arrays.items():
         if not np.isfinite(array).all():
             member = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise TrainingError(f"member {member}, step {step}: {name} is not finite")
+            where = f"member {member}, " if name.startswith("states.") else ""
+            raise TrainingError(f"{where}step {step}: {name} is not finite")

@@ -17,10 +17,10 @@ from pacesetter.config import Config
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts
-from pacesetter.policy import Floats, Policy, normalize, unstack
+from pacesetter.policy import Floats, Policy, clip, normalize, unstack
 from pacesetter.rules import RULES
 from pacesetter.seeding import Stream, generator
-from pacesetter.training.normalizer import Normalizer
+from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Population
 from pacesetter.training.progress import Member, Progress
 from pacesetter.training.replay import Columns, Replay
@@ -30,12 +30,12 @@ from pacesetter.training.selection import Selection, measure
 class Ensemble:
     """Everything that a run trains and trains on; what of it must survive is in checkpoint.py."""
 
-    def __init__(self, config: Config, envs: list[Environment], folder: Path) -> None:
+    def __init__(self, config: Config, envs: list[Environment]) -> None:
         run, hyper, first = config.run, config.hyper, envs[0]
         self.config, self.envs = config, envs
         spec = Spec(first.observation_size, first.action_size)
         self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
-        columns = Columns(*spec, self.algorithm.masks)
+        self.columns = columns = Columns(*spec, len(self.algorithm.mask(generator(0, Stream.MASK))))
         self.population = Population(
             self.algorithm, columns, run.members, run.seed, hyper.normalize_observation
         )
@@ -44,24 +44,32 @@ class Ensemble:
         self.loss_names = self.population.loss_names(self.states)
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps * config.unit
-        self.replays = [
-            Replay(folder / f"replay-{i}.bin", columns, hyper.replay_size, self.budget)
-            for i in range(1 if run.replay_scope == "shared" else run.members)
-        ]
+        self.replays: list[Replay] = []
         self.warmup_streams = [generator(run.seed, Stream.WARMUP, k) for k in range(run.members)]
         self.act_streams = [generator(run.seed, Stream.ACT, k) for k in range(run.members)]
         self.sample_streams = [generator(run.seed, Stream.SAMPLE, k) for k in range(run.members)]
+        self.mask_streams = [generator(run.seed, Stream.MASK, k) for k in range(run.members)]
         self.rule_stream = generator(run.seed, Stream.RULE)
         spare = generator(run.seed, Stream.ACT)
         self.memory = [self.algorithm.begin(acting, spare) for acting in self.acting]
         self.progress = Progress.of(run.members)
+        every = run.select_every * config.unit
+        self.progress.next_selection = (hyper.warmup // every + 1) * every
         self.trial_env: Environment | None = None
+
+    def open_replays(self, folder: Path) -> None:
+        """Make or find the rings, whose files take their whole space at once."""
+        count = 1 if self.config.run.replay_scope == "shared" else self.config.run.members
+        size = self.config.hyper.replay_size
+        for i in range(count):
+            path = folder / f"replay-{i}.bin"
+            self.replays.append(Replay(path, self.columns, size, self.budget))
 
     @property
     def streams(self) -> list[np.random.Generator]:
         """All random streams, in the order of the checkpoint."""
-        each = (*self.warmup_streams, *self.act_streams, *self.sample_streams)
-        return [*each, self.rule_stream]
+        each = (self.warmup_streams, self.act_streams, self.sample_streams, self.mask_streams)
+        return [*(rng for streams in each for rng in streams), self.rule_stream]
 
     def tick(self) -> Selection | None:
         """One tick; the selection, if it made one."""
@@ -79,11 +87,16 @@ class Ensemble:
         for replay in self.replays:
             replay.close()
 
+    @property
+    def statistics(self) -> Statistics:
+        """What observations are normalised by, now."""
+        return self.normalizer.statistics()
+
     def policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
         state = jax.tree.map(lambda x: x[member], self.states)
         actors, env = self.algorithm.policy(state), self.envs[0]
-        statistics = self.normalizer.statistics() if self.population.normalize else None
+        statistics = self.statistics if self.population.normalize else None
         layers = unstack(actors)
         return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
 
@@ -118,7 +131,7 @@ class Ensemble:
     def _explore(self, k: int) -> Floats:
         observation, rng = self.envs[k].observation, self.act_streams[k]
         if self.population.normalize:
-            observation = normalize(observation, *self.normalizer.statistics())
+            observation = normalize(observation, *self.statistics)
         acting, memory = self.acting[k], self.memory[k]
         action, self.memory[k] = self.algorithm.act(acting, memory, observation, rng)
         return action
@@ -126,19 +139,25 @@ class Ensemble:
     def _step(self, k: int, action: Floats) -> None:
         progress, member, env = self.progress, self.progress.members[k], self.envs[k]
         hyper = self.config.hyper
-        before = env.observation
+        if not np.isfinite(action).all():
+            raise TrainingError(f"action is not finite: {action}")
+        before, action = env.observation, clip(action)
         step = env.step(action)
         discount = hyper.gamma * (1.0 - step.terminated)
-        self.replay(k).add(before, action, step.reward, step.observation, discount, step.ended)
+        mask = self.algorithm.mask(self.mask_streams[k])
+        self.replay(k).add(
+            before, action, step.reward, step.observation, discount, step.ended, mask
+        )
         if self.population.normalize:
             self.normalizer.add(before)
         member.step(step.reward)
-        if progress.step > hyper.warmup:
+        if progress.step > hyper.warmup or hyper.warmup_updates:
             member.owed += hyper.updates_per_step
         if step.ended:
             progress.episodes += 1
-            progress.finished.append([k, member.episode_return, member.episode_length])
-            member.end(counts=member.started >= hyper.warmup)
+            progress.ended.append([k, member.episode_return, member.episode_length])
+            selects = self.config.run.members > 1 and self.config.run.select_on == "train"
+            member.end(counts=selects and member.started >= hyper.warmup)
 
     # Learn.
 
@@ -162,8 +181,8 @@ class Ensemble:
             members,
             np.stack([sample.rows for sample in samples]),
             np.stack(weights) if weights else None,
-            self.normalizer.statistics(),
-            progress.cycle,
+            self.statistics,
+            [progress.members[k].cycles for k in members],
         )
         self.states = result.states
         self._check(members, result.losses)
@@ -172,7 +191,7 @@ class Ensemble:
             self.replay(k).feedback(samples[place].slots, result.error[place])
             self.acting[k] = result.acting[place]
             progress.members[k].owed -= cycle
-        progress.cycle += 1
+            progress.members[k].cycles += 1
         progress.updates += cycle * len(members)
         progress.transitions += len(members) * shape[0] * shape[1]
 
@@ -240,10 +259,18 @@ class Ensemble:
         if run.rule != "none":
             self.states = self.population.inherit(self.states, parents, run.copy)
             self.acting = self.population.acting(self.states)
-            progress.champion = int(np.argmax(means[parents]))
+            progress.champion = champion(means, parents)
         progress.selections += 1
-        gap, error = measure(returns, progress.deviations)
+        gap, error = measure(returns, progress.variances)
         return Selection(parents.tolist(), progress.champion, returns.tolist(), gap, error)
+
+
+def champion(means: Any, parents: Any) -> int:
+    """The best member that went on from itself; if none did, the place of the best parent."""
+    themselves = np.flatnonzero(parents == np.arange(len(parents)))
+    if len(themselves):
+        return int(themselves[np.argmax(means[themselves])])
+    return int(np.argmax(means[parents]))
 
 
 class blame:  # noqa: N801 (a context manager reads as a verb)
@@ -256,5 +283,5 @@ class blame:  # noqa: N801 (a context manager reads as a verb)
         return None
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception):
+        if isinstance(error, TrainingError):
             raise TrainingError(f"{self.where}: {error}") from error

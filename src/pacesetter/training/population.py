@@ -1,7 +1,7 @@
 """One member's learner lifted over K members: the only place that knows the member axis of states.
 
-Every random key is (stream, tick, member) folded into the run's key, so a waiting member shifts
-nobody's stream and no state ever holds one.
+Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
+so a waiting member shifts nobody's stream and no state ever holds a key.
 """
 
 from enum import IntEnum
@@ -71,7 +71,7 @@ class Population:
         rows: Floats,
         weight: Floats | None,
         statistics: Statistics,
-        tick: int,
+        ticks: list[int],
     ) -> Cycle:
         """One cycle of each ready member on its own rows (ready, U, B, width).
 
@@ -79,14 +79,14 @@ class Population:
         """
         if len(ready) == self.members:
             states, losses, error, acting = self._update(
-                states, rows, weight, statistics, self.key, tick
+                states, rows, weight, statistics, self.key, np.array(ticks, np.uint32)
             )
             return Cycle(states, np.asarray(losses), np.asarray(error), self._each(acting))
         parts: list[Any] = []
         for place, member in enumerate(ready):
             weights = None if weight is None else weight[place]
             states, *part = self._update_one(
-                states, member, rows[place], weights, statistics, self.key, tick
+                states, member, rows[place], weights, statistics, self.key, ticks[place]
             )
             parts.append(part)
         losses, errors, acting = zip(*parts, strict=True)
@@ -103,22 +103,20 @@ class Population:
 
     def loss_names(self, states: State) -> list[str]:
         """Names of the columns of losses, in order."""
+        members = jnp.arange(self.members)
         rows = np.zeros((self.members, self.algorithm.cycle, 1, self.columns.width), np.float32)
-        statistics = (np.zeros(self.columns.observation), np.ones(self.columns.observation))
-        batch = self._batch(rows, None, statistics)
-        update = jax.eval_shape(
-            jax.vmap(self.algorithm.update),
-            states,
-            batch,
-            _keys(self.key, Draw.UPDATE, 0, np.arange(self.members)),
-        )
-        return sorted(update.losses)
+        size = self.columns.observation
+        batch = self._batch(rows, None, (np.zeros(size), np.ones(size)))
+        keys = _keys(self.key, Draw.UPDATE, members, members)
+        return sorted(jax.eval_shape(jax.vmap(self.algorithm.update), states, batch, keys).losses)
 
     # Below: what is compiled. States, rows and so on as above; `key` is an argument so that the
     # compiled program is the same for every seed.
 
     def _init_all(self, key: Array, members: Array) -> State:
-        return jax.vmap(self.algorithm.init)(_keys(key, Draw.INIT, 0, members))
+        return jax.vmap(self.algorithm.init)(
+            _keys(key, Draw.INIT, jnp.zeros_like(members), members)
+        )
 
     def _update_all(
         self,
@@ -127,9 +125,9 @@ class Population:
         weight: Array | None,
         statistics: Any,
         key: Array,
-        tick: int,
+        ticks: Array,
     ) -> tuple[State, Array, Array, Any]:
-        keys = self._all_keys(key, Draw.UPDATE, tick)
+        keys = _keys(key, Draw.UPDATE, ticks, jnp.arange(self.members))
         update = jax.vmap(self.algorithm.update)(
             states, self._batch(rows, weight, statistics), keys
         )
@@ -174,9 +172,6 @@ class Population:
         mean, deviation = statistics
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
-    def _all_keys(self, key: Array, draw: Draw, tick: int) -> Array:
-        return _keys(key, draw, tick, jnp.arange(self.members))
-
 
 def inherit(states: Any, parents: Array, copy: str) -> Any:
     """Each member's new state: `full` copies all of its parent's, `weights` leaves it its own
@@ -209,5 +204,5 @@ def _key(key: Array, draw: Draw, tick: Any, member: Any) -> Array:
     return key
 
 
-def _keys(key: Array, draw: Draw, tick: Any, members: Any) -> Array:
-    return jax.vmap(partial(_key, key, draw, tick))(members)
+def _keys(key: Array, draw: Draw, ticks: Any, members: Any) -> Array:
+    return jax.vmap(partial(_key, key, draw))(ticks, members)

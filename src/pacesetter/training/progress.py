@@ -13,6 +13,7 @@ class Member:
     """One member's counters and the episode it is in."""
 
     steps: int = 0
+    cycles: int = 0  # calls of `update` it has made
     owed: float = 0.0  # critic updates that have fallen due
     active: bool = True  # False while it waits for the others to end their episodes
     starting: bool = True  # its next tick begins an episode
@@ -45,20 +46,19 @@ class Progress:
 
     members: list[Member]
     tick: int = 0
-    cycle: int = 0
     selection_steps: int = 0
     updates: int = 0
     transitions: int = 0
     episodes: int = 0
     champion: int = 0
     selections: int = 0
-    deviations: list[float] = field(default_factory=list[float])
+    variances: list[float] = field(default_factory=list[float])  # of the last selections
     next_evaluation: int = 0
     last_evaluation: int = -1
     next_selection: int = 0
     next_train: int = TRAIN_ROW_EVERY
     best: float | None = None
-    finished: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
+    ended: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
     losses: list[float] = field(default_factory=list[float])  # sums since the last row
     updated: int = 0  # how many losses were summed
     wall_seconds: float = 0.0
@@ -94,9 +94,9 @@ class Progress:
     def training_values(self, loss_names: list[str]) -> dict[str, Any]:
         """Episodes ended as [member, return, length] and mean losses since the last row."""
         means = [total / self.updated for total in self.losses]
-        values: dict[str, Any] = {"episodes_ended": self.finished}
+        values: dict[str, Any] = {"episodes_ended": self.ended}
         values |= dict(zip(loss_names, means, strict=False))  # no losses before the first update
-        self.finished, self.losses, self.updated = [], [], 0
+        self.ended, self.losses, self.updated = [], [], 0
         return values
 
     def ledger(self) -> dict[str, Any]:

@@ -20,7 +20,8 @@ from pacesetter.storage import digest
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
-SLACK = 2 * UNCOMMITTED + BLOCK
+MEMBERS = 1_000  # at most, each of which may add a row before the next checkpoint
+SLACK = 2 * (UNCOMMITTED + MEMBERS) + BLOCK
 
 
 class Columns(NamedTuple):
@@ -70,7 +71,9 @@ class Replay:
         self.committed = 0  # rows that the latest checkpoint covers
         self.hashes: list[str] = []  # of each complete block since the first row
         self._map = _map_file(path, min(self.slots, budget) * columns.width * 4)
-        self.rows: Floats = np.frombuffer(self._map, np.float32).reshape(-1, columns.width)
+        count = len(self._map) // (4 * columns.width)
+        flat = np.frombuffer(self._map, np.float32, count * columns.width)
+        self.rows: Floats = flat.reshape(count, columns.width)
 
     def __len__(self) -> int:
         return min(self.head, self.capacity)
@@ -88,6 +91,7 @@ class Replay:
         following: Floats,
         discount: float,
         last: bool,
+        mask: Floats,
     ) -> None:
         """Store one transition; `following` is what step() returned, never a reset observation."""
         row = self.rows[self.head % self.slots]
@@ -98,6 +102,7 @@ class Replay:
         row[middle + 1 : middle + 1 + size] = following
         row[middle + 1 + size] = discount
         row[middle + 2 + size] = last
+        row[middle + 3 + size :] = mask
         self.head += 1
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Sample:
@@ -135,9 +140,8 @@ class Replay:
             raise UsageError(f"{self.path}: damaged: its newest rows differ")
 
     def close(self) -> None:
-        """Let go of the file."""
-        self.rows = np.zeros((0, self.columns.width), np.float32)
-        self._map.close()
+        """Let go of the file, which is unmapped with its last user."""
+        del self.rows, self._map
 
     def _first_block(self) -> int:
         return (self.head - len(self)) // BLOCK
@@ -155,15 +159,19 @@ class Replay:
 
 
 def _map_file(path: Path, size: int) -> mmap.mmap:
-    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        path.parent.mkdir(exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be opened: {error.strerror}") from None
     try:
         size = max(size, os.fstat(file).st_size)
         # Without real blocks behind it, a full disk would kill the process at a later write.
         os.posix_fallocate(file, 0, size)
         return mmap.mmap(file, size)
-    except OSError as error:
+    except (OSError, OverflowError) as error:
         raise UsageError(
-            f"{path}: cannot reserve {size / 1e6:.0f} MB for the replay: {error.strerror}; "
+            f"{path}: cannot reserve {size / 1e6:.0f} MB for the replay: {error}; "
             "free space or lower --replay-size"
         ) from None
     finally:

@@ -10,7 +10,7 @@ import jax
 
 from pacesetter.config import read_file, settle
 from pacesetter.envs import Environment
-from pacesetter.errors import UsageError
+from pacesetter.errors import TrainingError, UsageError
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find, versions
@@ -55,10 +55,14 @@ class Trainer:
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
         _prepare_jax(self.config.run.device)
-        envs = self._make_envs()
+        self._begin()
         self.directory.create(self.config)
-        self._begin(envs)
-        checkpoint.save(self.ensemble, self.directory)
+        try:
+            self.ensemble.open_replays(self.directory.state_file.parent)
+            checkpoint.save(self.ensemble, self.directory)
+        except BaseException:
+            self.directory.remove()
+            raise
         self.notes: list[str] = []
 
     @classmethod
@@ -80,44 +84,48 @@ class Trainer:
             settings = self.config.settings() | changed
             self.config = settle(self.config.run.algorithm, self.config.run.env, settings)
         _prepare_jax(self.config.run.device)
-        envs = self._make_envs()
+        self._begin()
         self.directory.lock()
         try:
             self.directory.sweep()
-            self._begin(envs)
+            self.ensemble.open_replays(self.directory.state_file.parent)
             self.notes = checkpoint.restore(self.ensemble, self.directory)
-            if changed:
-                self.directory.write_config(self.config)
+            if self.progress.step > self.budget:
+                raise UsageError(
+                    f"steps: the run has made {self.progress.step:,} already; give more"
+                )
+            self.directory.note_resume(self.config, self.progress.step)
         except BaseException:
             self.directory.unlock()
             raise
         return self
 
-    def _make_envs(self) -> list[Environment]:
+    def _begin(self) -> None:
         run = self.config.run
         envs = [
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, member)
             for member in range(run.members)
         ]
         envs[0].check()
-        return envs
-
-    def _begin(self, envs: list[Environment]) -> None:
-        self.ensemble = Ensemble(self.config, envs, self.directory.state_file.parent)
+        self.ensemble = Ensemble(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []
-        self._stopping = False
+        self._stopping = self._closed = False
+        self._clock = Clock()
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""
+        self._refuse_closed()
         self._clock = Clock()
         self._saved_at = self.progress.wall_seconds
         try:
             while True:
-                self._report_what_is_due()
+                self._clock.tell(self.progress)
+                ending = self.finished
+                self._report_what_is_due(ending)
                 reports, self._reports = self._reports, []
                 yield from reports
-                if self.finished or self._stopping:
+                if ending or self._stopping:
                     break
                 if self._save_is_due():
                     self.save()
@@ -128,6 +136,10 @@ class Trainer:
         except GeneratorExit:
             self.save()
             raise
+        except OSError as error:
+            raise TrainingError(
+                f"step {self.progress.step}: {self.directory.path}: {error.strerror or error}"
+            ) from error
         finally:
             self.close()
 
@@ -155,16 +167,26 @@ class Trainer:
 
     def save(self) -> None:
         """Write a checkpoint now."""
+        self._refuse_closed()
         self._clock.tell(self.progress)
         checkpoint.save(self.ensemble, self.directory)
         self._saved_at = self.progress.wall_seconds
 
     def close(self) -> None:
         """Let go of envs, files and the folder."""
-        self.ensemble.close()
-        if self._evaluation_env is not None:
-            self._evaluation_env.close()
-        self.directory.unlock()
+        self._closed = True
+        try:
+            self.ensemble.close()
+            if self._evaluation_env is not None:
+                self._evaluation_env.close()
+        finally:
+            self.directory.unlock()
+
+    def _refuse_closed(self) -> None:
+        if self._closed:
+            raise UsageError(
+                f"run: this trainer has ended; Trainer.resume('{self.directory.path}')"
+            )
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
@@ -177,20 +199,20 @@ class Trainer:
 
     # What is due: evaluations, rows of the log, checkpoints.
 
-    def _report_what_is_due(self) -> None:
+    def _report_what_is_due(self, ending: bool) -> None:
         progress = self.progress
-        self._clock.tell(progress)
-        if progress.step >= progress.next_train:
+        pending = ending and bool(progress.ended or progress.losses)
+        if progress.step >= progress.next_train or pending:
             progress.next_train = (progress.step // TRAIN_ROW_EVERY + 1) * TRAIN_ROW_EVERY
             self._emit("train", progress.training_values(self.ensemble.loss_names))
-        last = self.finished and progress.last_evaluation < progress.step
+        last = ending and progress.last_evaluation < progress.step
         if progress.step >= progress.next_evaluation or last:
-            self._evaluate()
+            self._evaluate(ending)
             every = self.config.run.eval_every * self.config.unit
             progress.last_evaluation = progress.step
             progress.next_evaluation = (progress.step // every + 1) * every
 
-    def _evaluate(self) -> None:
+    def _evaluate(self, ending: bool) -> None:
         """Evaluate the champion on starts of its own and write the policy files."""
         run, progress = self.config.run, self.progress
         policy = self.policy()
@@ -203,7 +225,7 @@ class Trainer:
             policy.about["score_note"] = "the best of many evaluations, so biased upwards"
             policy.save(self.directory.best_file)
         values = trial.table() | {"champion": progress.champion}
-        if self.finished and run.rule == "none" and run.members > 1:
+        if ending and run.rule == "none" and run.members > 1:
             values["members"] = [self._trial(self.policy(k)).mean for k in range(run.members)]
         self._emit("eval", values)
 
@@ -229,11 +251,11 @@ class Trainer:
 
 def _prepare_jax(device: str) -> None:
     """Choose the device and keep compiled programs, of which JAX stores none by default."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and "HOME" in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if device != "auto":
         jax.config.update("jax_default_device", _device(device))
 
