@@ -156,7 +156,7 @@ def read_file(path: Path) -> Settings:
     try:
         text = path.read_text()
         table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"config: cannot read {path}: {error}") from None
     if not isinstance(table, dict):
         raise UsageError(f"config: {path} holds no table of settings")

@@ -3,12 +3,20 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+LONGEST = 500
 
-class UsageError(Exception):
+
+class _OneLine(Exception):  # noqa: N818
+    def __init__(self, message: str) -> None:
+        text = " ".join(message.split())
+        super().__init__(text if len(text) <= LONGEST else f"{text[:LONGEST]}...")
+
+
+class UsageError(_OneLine):
     """Bad input: an unknown name, a value out of range, a damaged file. Exit code 2."""
 
 
-class TrainingError(Exception):
+class TrainingError(_OneLine):
     """A run that cannot go on, such as one with a NaN; its last good checkpoint is kept."""
 
 

@@ -70,6 +70,10 @@ def evaluate(
     """
     if episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
+    if seed < 0:
+        raise UsageError(f"seed: must be at least 0, got {seed}")
+    if not 0 <= noise < inf:
+        raise UsageError(f"noise: must be a finite number, at least 0, got {noise}")
     world = enter(policy, env, seed, env_kwargs)
     try:
         return rollouts(_acting(policy, world, noise, seed), world, episodes)

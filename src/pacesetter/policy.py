@@ -15,6 +15,7 @@ Floats = NDArray[np.float32]
 Layers = Sequence[dict[str, Floats]]
 KIND = "policy"
 SCHEMA = 1
+LAYERS = ({"kernel", "bias"}, {"kernel", "bias", "scale", "offset"})
 NORM_EPSILON = np.float32(1e-5)
 OBSERVATION_LIMIT = 10.0
 
@@ -54,7 +55,8 @@ class Actors(NamedTuple):
 
 def to_env(action: Floats, low: Floats, high: Floats) -> Floats:
     """Clip an action to [-1, 1] and scale it to the env's own bounds; nowhere else is this done."""
-    scaled = low + (high - low) * (clip(action) + np.float32(1)) / np.float32(2)
+    share = (clip(action) + np.float32(1)) / np.float32(2)
+    scaled = low * (np.float32(1) - share) + high * share
     return np.minimum(np.maximum(scaled, low), high)
 
 
@@ -138,7 +140,7 @@ def load(path: str | Path) -> Policy:
             low=arrays["low"],
             high=arrays["high"],
             normalizer=(arrays["mean"], arrays["deviation"]) if "mean" in arrays else None,
-            about=dict(table["about"]),
+            about=table["about"],
         )
         _check(policy, arrays)
     except storage.FAULTS as error:
@@ -148,7 +150,9 @@ def load(path: str | Path) -> Policy:
 
 def _check(policy: Policy, arrays: storage.Arrays) -> None:
     """Refuse shapes that do not fit each other, before they are computed with."""
-    about = policy.about
+    about: Any = policy.about
+    if not isinstance(about, dict):
+        raise ValueError("about must be a table")
     kinds = {"env": str, "env_kwargs": dict, "step": int}
     for name, kind in kinds.items():
         if not isinstance(about.get(name, kind()), kind):
@@ -160,6 +164,8 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     for layers in policy.actors:
         size = inputs
         for layer in layers:
+            if layer.keys() not in LAYERS:
+                raise ValueError(f"a layer has {', '.join(sorted(layer))}")
             shape = layer["kernel"].shape
             if len(shape) != 2 or shape[0] != size:
                 raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")

@@ -91,11 +91,15 @@ class RunDirectory:
         """The whole config.json."""
         try:
             table = json.loads(self.config_file.read_text())
-            if table["schema"] != SCHEMA or not isinstance(table["settings"], dict):
+            if table["schema"] != SCHEMA:
                 raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
+            if not isinstance(table.get("threads"), int):
+                raise ValueError("threads must be a whole number")
+            if not all(isinstance(table["settings"][key], str) for key in ("algorithm", "env")):
+                raise ValueError("algorithm and env must be words")
         except FileNotFoundError:
             raise UsageError(f"run: {self.path} holds no run (no config.json)") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise UsageError(f"{self.config_file}: damaged or foreign: {error}") from None
         return table
 
@@ -115,8 +119,8 @@ class RunDirectory:
         """All complete lines of the log."""
         if not self.metrics_file.exists():
             return []
-        lines = self.metrics_file.read_text().split("\n")[:-1]
         try:
+            lines = self.metrics_file.read_text().split("\n")[:-1]
             return [json.loads(line) for line in lines]
         except ValueError as error:
             raise UsageError(f"{self.metrics_file}: damaged: {error}") from None

@@ -54,10 +54,7 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
         file.flush()
         os.fsync(file.fileno())
     if keep is not None and path.exists():
-        other = keep.with_name(keep.name + TEMPORARY)
-        other.unlink(missing_ok=True)
-        os.link(path, other)
-        other.replace(keep)
+        link(path, keep)
     temporary.replace(path)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -66,10 +63,18 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
         os.close(folder)
 
 
+def link(path: Path, to: Path) -> None:
+    """Make a file reachable by another name too, in place of what has that name."""
+    temporary = to.with_name(to.name + TEMPORARY)
+    temporary.unlink(missing_ok=True)
+    os.link(path, temporary)
+    temporary.replace(to)
+
+
 def write(path: Path, kind: str, content: Content, keep: Path | None = None) -> None:
     """Write arrays and table with the hash of each array."""
     # safetensors 0.8 silently writes wrong bytes for transposed or sliced arrays.
-    arrays = {name: np.ascontiguousarray(array) for name, array in content.arrays.items()}
+    arrays = {name: array.copy(order="C") for name, array in content.arrays.items()}
     hashes = {name: digest(array) for name, array in arrays.items()}
     table = json.dumps(content.table, sort_keys=True)
     manifest = {
@@ -95,7 +100,10 @@ def read(path: Path, kind: str) -> Content:
             damaged.append("its table")
         if damaged:
             raise UsageError(f"{path}: damaged: {', '.join(sorted(damaged)[:3])}")
-        return Content(arrays, json.loads(manifest["table"]))
+        table = json.loads(manifest["table"])
+        if not isinstance(table, dict):
+            raise ValueError("its table is none")
+        return Content(arrays, table)
     except FileNotFoundError:
         raise UsageError(f"{path}: no such file") from None
     except OSError as error:

@@ -4,7 +4,9 @@ One critic, no delay, no noise on the target action; everything else is TD3's. T
 `ddpg-original` sets what differs in Lillicrap et al. 2016; without batch normalisation.
 """
 
-from pydantic import Field
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import Spec
@@ -12,13 +14,26 @@ from pacesetter.algorithms import td3
 from pacesetter.config import STRICT
 
 
+def only(value: float) -> AfterValidator:
+    """A setting that this algorithm fixes."""
+
+    def check(given: float) -> float:
+        if given != value:
+            raise ValueError(f"is fixed for this algorithm; allowed: {value}")
+        return given
+
+    return AfterValidator(check)
+
+
 @settings(frozen=True, kw_only=True, config=STRICT)
 class Hyper(td3.Hyper):
     """TD3's settings with the tricks fixed off, and what only the original paper changes."""
 
-    critics: int = Field(1, ge=1, le=1, description="fixed: one critic")
-    policy_delay: int = Field(1, ge=1, le=1, description="fixed: the actor moves at every update")
-    target_noise: float = Field(0.0, ge=0, le=0, description="fixed: no target smoothing")
+    critics: Annotated[int, only(1)] = Field(1, description="fixed: one critic")
+    policy_delay: Annotated[int, only(1)] = Field(
+        1, description="fixed: the actor moves at every update"
+    )
+    target_noise: Annotated[float, only(0)] = Field(0.0, description="fixed: no target smoothing")
     action_layer: int = Field(0, ge=0, le=1, description="critic layer that the action joins")
     critic_decay: float = Field(0.0, ge=0, description="L2 added to the critic's gradient")
     output_bound: float | None = Field(None, gt=0, description="bound of initial output weights")

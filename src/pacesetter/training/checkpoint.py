@@ -57,6 +57,8 @@ def restore(ensemble: Ensemble, directory: RunDirectory) -> list[str]:
         except UsageError as error:
             notes.append(f"{error}; trying the checkpoint before it")
             continue
+        if file != directory.state_file:  # the next save must not keep the damaged one instead
+            storage.link(file, directory.state_file)
         return notes
     if not notes and directory.log_size():
         notes = [f"{directory.state_file}: is missing"]

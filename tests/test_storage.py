@@ -1,0 +1,105 @@
+"""What is written is read back, byte for byte, and a failed write leaves what was there."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pacesetter import storage
+from pacesetter.errors import UsageError
+from pacesetter.storage import Content
+
+BASE = np.arange(24, dtype=np.float32).reshape(4, 6)
+# safetensors alone writes wrong bytes for most of these, and says nothing.
+LAYOUTS = {
+    "plain": BASE,
+    "transposed": BASE.T,
+    "columns": BASE[:, ::2],
+    "rows": BASE[1:3],
+    "backwards": BASE[::-1, ::-1],
+    "fortran": np.asfortranarray(BASE),
+    "broadcast": np.broadcast_to(BASE[0], (3, 6)),
+    "swapped axes": BASE.reshape(2, 3, 4).swapaxes(0, 2),
+    "one number": np.float32(3),
+    "empty": np.zeros((0, 5), np.float32),
+    "flags": BASE.T > 5,
+    "counts": BASE.astype(np.int32).T,
+    "doubles": BASE.astype(np.float64)[:, 1],
+    "read-only": np.frombuffer(bytes(48), np.float32),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_any_layout_is_read_back(layout: str, tmp_path: Path) -> None:
+    array = np.asarray(LAYOUTS[layout])
+    file = tmp_path / "file"
+    storage.write(file, "thing", Content({"a": array, "b": BASE}, {}))
+    found = storage.read(file, "thing").arrays
+    assert found["a"].dtype == array.dtype
+    np.testing.assert_array_equal(found["a"], array, strict=True)
+    np.testing.assert_array_equal(found["b"], BASE)
+
+
+def test_random_layouts_are_read_back(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Any permutation of axes with any steps along them."""
+    arrays = {}
+    for n in range(60):
+        array = rng.normal(size=rng.integers(1, 6, size=rng.integers(1, 5))).astype(np.float32)
+        steps = rng.choice([-2, -1, 1, 2], size=array.ndim)
+        arrays[str(n)] = array.transpose(rng.permutation(array.ndim))[
+            tuple(slice(None, None, step) for step in steps)
+        ]
+    storage.write(tmp_path / "file", "thing", Content(arrays, {}))
+    found = storage.read(tmp_path / "file", "thing").arrays
+    assert found.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array, strict=True)
+
+
+def test_table_is_read_back(tmp_path: Path) -> None:
+    table = {"text": "ä\n\0", "huge": 2**200, "part": 0.1, "list": [1, None, True], "deep": {"": 1}}
+    storage.write(tmp_path / "file", "thing", Content({}, table))
+    assert storage.read(tmp_path / "file", "thing").table == table
+
+
+def test_kind_is_checked(tmp_path: Path) -> None:
+    storage.write(tmp_path / "file", "thing", Content({}, {}))
+    with pytest.raises(UsageError, match="no pacesetter other"):
+        storage.read(tmp_path / "file", "other")
+
+
+def test_replaced_file_is_kept(tmp_path: Path) -> None:
+    """`keep` always holds the write before the last."""
+    file, keep = tmp_path / "file", tmp_path / "before"
+    for n in range(4):
+        storage.write(file, "thing", Content({}, {"n": n}), keep)
+        assert storage.read(file, "thing").table == {"n": n}
+        assert not keep.exists() if n == 0 else storage.read(keep, "thing").table == {"n": n - 1}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["before", "file"]
+
+
+STEPS = ("fsync", "link", "unlink", "replace")
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_failure_at_any_step_leaves_a_whole_file(
+    step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk, or when killed there: the old file or the new, never a part or none."""
+    file, keep = tmp_path / "file", tmp_path / "before"
+    for n in range(2):
+        storage.write(file, "thing", Content({"a": BASE}, {"n": n}), keep)
+
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os if step in ("fsync", "link") else Path, step, fail)
+        with pytest.raises(OSError, match="No space"):
+            storage.write(file, "thing", Content({"a": BASE}, {"n": 2}), keep)
+    assert storage.read(file, "thing").table == {"n": 1}
+    storage.write(file, "thing", Content({"a": BASE}, {"n": 3}), keep)
+    assert storage.read(file, "thing").table == {"n": 3}
+    assert storage.read(keep, "thing").table == {"n": 1}
