@@ -11,7 +11,7 @@ from pacesetter.training.trainer import Trainer
 
 CASES = {
     "td3": {"env": "HalfCheetah-v5"},
-    "multi-td3": {"env": "HalfCheetah-v5", "steps": 4_300},
+    "multi-td3": {"env": "HalfCheetah-v5", "steps": 3_300},
     "multi-ant": {"env": "Ant-v5", "algorithm": "multi-td3", "members": 3},
     "wrapped": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_size": 300},
     "ou": {"env": "Hopper-v5", "algorithm": "ddpg", "exploration": "ou", "members": 2},
@@ -24,25 +24,27 @@ CASES = {
     },
     "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
     "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
+    "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
 }
 
 
 def start(case: str, runs: Path, name: str) -> Trainer:
-    settings = {**TINY, "steps": 2_300, "algorithm": "td3", "name": name, **CASES[case]}
+    settings = {**TINY, "steps": 1_500, "algorithm": "td3", "name": name, **CASES[case]}
     return Trainer(settings.pop("algorithm"), settings.pop("env"), runs=runs, **settings)
 
 
 def stop_at(trainer: Trainer, tick: int) -> None:
     """Run until a tick has passed, then end as a signal would."""
-    turn = trainer._turn
+    once = trainer.ensemble.tick
 
-    def turn_and_stop() -> None:
-        turn()
+    def tick_and_stop() -> object:
+        selection = once()
         if trainer.progress.tick >= tick:
             trainer.stop()
+        return selection
 
-    trainer._turn = turn_and_stop
+    trainer.ensemble.tick = tick_and_stop
     run_to_end(trainer)
 
 
@@ -53,10 +55,10 @@ def test_stopped_anywhere_equals_uninterrupted(
     # Small blocks, so that the ring of the `wrapped` case really goes round several times.
     monkeypatch.setattr(replay, "BLOCK", 64)
     monkeypatch.setattr(replay, "UNCOMMITTED", 150)
-    monkeypatch.setattr(replay, "SLACK", 2 * 150 + 64)
+    monkeypatch.setattr(replay, "SLACK", 2 * (150 + 3) + 64)
     whole = run_to_end(start(case, runs, "whole"))
     stopped = start(case, runs, "stopped")
-    ticks = np.sort(np.random.default_rng(len(case)).choice(900, size=3, replace=False))
+    ticks = np.sort(np.random.default_rng(len(case)).choice(450, size=2, replace=False))
     for tick in ticks:
         stop_at(stopped, int(tick))
         assert not stopped.finished
