@@ -21,7 +21,7 @@ demo: .venv/installed
 	$(BIN)/python examples/demo.py
 
 test: .venv/tested
-	$(BIN)/pytest -m 'not slow'
+	$(BIN)/pytest -m 'not slow' -n 2
 
 test-slow: .venv/tested
 	$(BIN)/pytest -m slow

@@ -12,14 +12,14 @@ from pacesetter.training.trainer import Trainer
 
 LEARNS: dict[str, Any] = {
     **TINY,
-    "hidden": (32, 32),
+    "hidden": (64, 64),
     "batch_size": 64,
-    "steps": 800,
+    "steps": 1_000,
     "warmup": 200,
     "gamma": 0.5,
     "tau": 0.05,
-    "actor_learning_rate": 2e-3,
-    "critic_learning_rate": 5e-3,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 3e-3,
     "exploration_noise": 0.5,
     "eval_every": 10_000,
 }

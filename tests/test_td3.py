@@ -15,7 +15,7 @@ from pacesetter.algorithm import Batch, Spec
 from pacesetter.algorithms.td3 import TD3, State
 from pacesetter.config import settle
 from pacesetter.policy import Policy, load, to_env, unstack
-from pacesetter.training.trainer import Trainer
+from pacesetter.training.trainer import Trainer, _prepare_jax
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(3)
@@ -50,6 +50,12 @@ fit_critic = _compiled(TD3.fit_critic)
 fit_actor = _compiled(TD3.fit_actor)
 values = _compiled(TD3.values)
 asked = _compiled(_asked)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _keep_compiled() -> None:
+    """Programs are kept between test runs, as a trainer keeps them."""
+    _prepare_jax("auto")
 
 
 def learner(name: str = "td3", spec: Spec = SPEC, **hyper: Any) -> TD3:
@@ -612,9 +618,9 @@ def test_policy_file_acts_as_the_learner(
 ) -> None:
     """JAX, the NumPy that acts in training and a saved and loaded file agree to 1e-6."""
     algorithm = learner(hidden=(32, 24), actor_layer_norm=norm, exploration_noise=0.0)
-    state = fresh(algorithm)
+    state = jax.tree.map(lambda x: np.asarray(0.4 * x, x.dtype), fresh(algorithm))
     mean = np.array([3, -2, 0], np.float32)
-    deviation = np.array([2, 0.5, 1e-3], np.float32)  # the last one is cut at +-10
+    deviation = np.array([2, 3, 0.3], np.float32)  # by which the last one is often cut at +-10
     low, high = np.array([-0.4, 0], np.float32), np.array([0.4, 5], np.float32)
     actors = algorithm.policy(state)
     layers = unstack(actors)
@@ -624,7 +630,8 @@ def test_policy_file_acts_as_the_learner(
     observations = rng.normal(size=(50, 3), scale=3).astype(np.float32)
     scaled = np.clip((observations - mean) / deviation, -10, 10)
     expected = np.asarray(jax.jit(nets.actor)(state.actor, scaled))
-    assert np.all(expected.std(axis=0) > 0.02)
+    assert np.all(expected.std(axis=0) > 0.01)
+    assert 0.1 < np.mean(np.abs(scaled[:, 2]) == 10) < 0.9
     np.testing.assert_allclose(loaded.act(observations), expected, rtol=0, atol=1e-6)
     in_env = low + (high - low) * (expected + 1) / 2
     np.testing.assert_allclose(loaded(observations), in_env, rtol=0, atol=5e-6)
