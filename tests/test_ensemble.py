@@ -55,8 +55,10 @@ def script(env: Any, **attributes: Any) -> None:
 def until(trainer: Trainer, kind: str) -> Iterator[Report]:
     """The first report of a kind, with the trainer as it is at that moment."""
     reports = iter(trainer)
+    found = next((report for report in reports if report.kind == kind), None)
+    assert found is not None, f"the run ended without a {kind}"
     try:
-        yield next(report for report in reports if report.kind == kind)
+        yield found
     finally:
         reports.close()  # type: ignore[attr-defined]
 
@@ -566,11 +568,12 @@ STARTS = [Stream.TRAIN, Stream.SELECT, Stream.EVALUATE, Stream.REPORT]
     places=st.lists(st.integers(0, 2**20), min_size=4, max_size=4),
 )
 def test_streams_never_share_a_start(seed: int, streams: list[Stream], places: list[int]) -> None:
-    """Whatever members and episodes they are at."""
+    """Whatever members and episodes they are at, since even the low bits of the seeds differ."""
     one, other = streams
     a, b, c, d = places
-    assert episode_seed(seed, one, a, b) != episode_seed(seed, other, c, d)
-    assert 0 <= episode_seed(seed, one, a, b) < 2**32
+    first, second = episode_seed(seed, one, a, b), episode_seed(seed, other, c, d)
+    assert first % 8 != second % 8
+    assert 0 <= first < 2**32
 
 
 def test_the_seed_decides_everything(runs: Path) -> None:

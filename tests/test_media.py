@@ -26,15 +26,16 @@ TOLD = ("MUJOCO_GL", "IMAGEIO_FFMPEG_NO_PREVENT_SIGINT")
 def untrained(env: str, **about: Any) -> Policy:
     """One linear layer of the right size."""
     world = make(env)
-    observations, actions = world.observation_space.shape, world.action_space.shape
+    box: Any = world.action_space
+    observations, actions = world.observation_space.shape, box.shape
+    low, high = box.low.astype(np.float32), box.high.astype(np.float32)
     world.close()
     assert observations is not None
     assert actions is not None
     weights = np.random.default_rng(3).normal(0, 0.3, (observations[0], actions[0]))
     kernel, bias = weights.astype(np.float32), np.zeros(actions, np.float32)
-    bound = np.ones(actions, np.float32)
     layers = [{"kernel": kernel, "bias": bias}]
-    return Policy([layers], "relu", "tanh", -bound, bound, about={"env": env, **about})
+    return Policy([layers], "relu", "tanh", low, high, about={"env": env, **about})
 
 
 @pytest.fixture
@@ -120,7 +121,7 @@ def test_camera_follows_the_walker_far_from_the_start(cheetah: Policy) -> None:
     from pacesetter.media import record as module
 
     with module._gl():
-        world = module._enter(cheetah, None, 0)
+        world = module.enter(cheetah, None, 0, render_mode="rgb_array")
         module._aim(world, (320, 240))
         world.reset(0)
         task: Any = world.env.unwrapped
@@ -235,8 +236,10 @@ def test_a_file_cannot_make_its_reader_import_a_module(tmp_path: Path) -> None:
 def handmade(folder: Path, rows: list[dict[str, Any]]) -> RunDirectory:
     """A run of only a config and a log."""
     folder.mkdir()
-    settings = {"env": "HalfCheetah-v5", "name": "tiny", "seed": 4}
-    (folder / "config.json").write_text(json.dumps({"schema": 1, "settings": settings}))
+    settings = {"algorithm": "td3", "env": "HalfCheetah-v5", "name": "tiny", "seed": 4}
+    (folder / "config.json").write_text(
+        json.dumps({"schema": 1, "threads": 2, "settings": settings})
+    )
     (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return RunDirectory(folder)
 
