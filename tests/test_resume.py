@@ -48,7 +48,12 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
-@pytest.mark.parametrize("case", CASES)
+SLOW = ("normalized", "sac", "ou", "own-replays")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow if c in SLOW else ()) for c in CASES]
+)
 def test_stopped_anywhere_equals_uninterrupted(
     case: str, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
