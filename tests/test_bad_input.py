@@ -414,7 +414,7 @@ def test_kill_after_falling_back(
 def test_checkpoint_of_another_run(run: RunDirectory, refused: Refused) -> None:
     """Sizes that differ are named, not loaded."""
     arrays, table = storage.read(run.state_file, "checkpoint")
-    arrays["states.actor.0.bias"] = arrays["states.actor.0.bias"][:, :8]
+    arrays["states.0.actor.0.bias"] = arrays["states.0.actor.0.bias"][:8]
     storage.write(run.state_file, "checkpoint", storage.Content(arrays, table))
     run.previous_file.unlink()
     words = ["state.safetensors", "does not fit", "actor.0.bias", "(1, 8)", "(1, 16)"]

@@ -24,7 +24,7 @@ from pacesetter.training.population import Population, inherit
 from pacesetter.training.replay import Columns
 from pacesetter.training.selection import REMEMBERED, measure
 from pacesetter.training.trainer import Report, Trainer
-from test_td3 import SPEC, all_differ, fresh, learner, member, same
+from test_td3 import SPEC, all_differ, fresh, learner, same
 
 ENV = "probe_envs:Scripted-v0"
 IDLE = {"updates_per_step": 1e-9}  # nobody learns, where only counting matters
@@ -91,9 +91,8 @@ def test_members_that_do_not_meet_learn_as_if_alone(runs: Path) -> None:
     run_to_end(alone)
     run_to_end(apart)
     assert apart.progress.members[0].steps == alone.progress.members[0].steps == 60
-    one, other = (jax.device_get(member(trainer.ensemble.states, 0)) for trainer in (apart, alone))
-    close = {"rtol": 1e-5, "atol": 1e-7}
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **close), one, other)
+    one, other = (jax.device_get(trainer.ensemble.states[0]) for trainer in (apart, alone))
+    assert same(one, other)
 
 
 # A selection.
@@ -103,26 +102,26 @@ def test_selection_copies_the_winner_whole(runs: Path) -> None:
     """After returns 3 and 5 both hold what member 1 held: networks, moments and counter."""
     trainer = start(runs)
     before: list[Any] = []
-    inherit_all = trainer.ensemble.population.inherit
+    descend = trainer.ensemble.descend
 
-    def watched(states: Any, *rest: Any) -> Any:
-        before.append(jax.device_get(states))
-        return inherit_all(states, *rest)
+    def watched(parents: Any) -> None:
+        before.extend(jax.device_get(trainer.ensemble.states))
+        descend(parents)
 
-    trainer.ensemble.population.inherit = watched
+    trainer.ensemble.descend = watched
     with until(trainer, "select") as report:
         assert report.step == 20
         assert report.values["returns"] == [[3], [5]]
         assert report.values["parents"] == [1, 1]
         assert report.values["champion"] == trainer.progress.champion == 1
-        winner, after = member(before[0], 1), jax.device_get(trainer.ensemble.states)
+        winner, after = before[1], jax.device_get(trainer.ensemble.states)
     moments = [x for x in jax.tree.leaves(winner.critic_optimizer) if x.ndim]
     assert all(np.any(x) for x in moments)
     assert winner.updates == 10
     for part in NETWORKS:
-        assert all_differ(getattr(member(before[0], 0), part), getattr(winner, part))
-    assert same(member(after, 0), winner)
-    assert same(member(after, 1), winner)
+        assert all_differ(getattr(before[0], part), getattr(winner, part))
+    assert same(after[0], winner)
+    assert same(after[1], winner)
 
 
 def test_copies_share_no_buffer_and_no_noise(runs: Path, rng: np.random.Generator) -> None:
@@ -133,17 +132,17 @@ def test_copies_share_no_buffer_and_no_noise(runs: Path, rng: np.random.Generato
     with until(trainer, "select"):
         states = jax.device_get(ensemble.states)
         for acting, rng_k in zip(ensemble.acting, ensemble.act_streams, strict=True):
-            assert same(acting, member(states.actor, 1))
+            assert same(acting, states[1].actor)
             action, _ = ensemble.algorithm.act(acting, (), observation, copy.deepcopy(rng_k))
             actions.append(action)
-        rows = ensemble.replays[0].sample(rng, (1, 2, 16)).rows
-        copied = jax.tree.map(jnp.copy, ensemble.states)
-        moved = ensemble.population.update(copied, [0], rows, None, statistics, [99])
-        moved = jax.device_get(moved.states)
+        rows = ensemble.replays[0].sample(rng, (2, 16)).rows
+        moved = ensemble.population.update(ensemble.states[0], 0, 99, rows, None, statistics)
+        ensemble.states[0] = moved.state
+        after = jax.device_get(ensemble.states)
     assert not np.any(actions[0] == actions[1])
-    assert same(member(states, 0), member(states, 1))
-    assert same(member(moved, 1), member(states, 1))
-    assert all_differ(member(moved, 0), member(states, 0))
+    assert same(states[0], states[1])
+    assert same(after[1], states[1])
+    assert all_differ(after[0], states[0])
 
 
 def test_ties_go_to_the_first(runs: Path) -> None:
@@ -174,56 +173,56 @@ def test_renaming_members_changes_only_names(runs: Path) -> None:
 
 # What is copied.
 
-copy_by = jax.jit(inherit, static_argnums=2)
-
 
 @pytest.fixture
 def states(rng: np.random.Generator) -> Any:
     """Three members, no two of whose numbers are alike, optimisers included."""
-    like = fresh(learner(), members=3)
-    return jax.tree.map(lambda x: rng.uniform(1, 1e6, x.shape).astype(x.dtype), like)
+    like = fresh(learner())
+    return [
+        jax.tree.map(lambda x: jnp.asarray(rng.uniform(1, 1e6, x.shape), x.dtype), like)
+        for _ in range(3)
+    ]
 
 
 PARENTS = np.array([1, 1, 0])
 
 
 def test_full_copy_takes_everything(states: Any) -> None:
-    new = jax.device_get(copy_by(states, PARENTS, "full"))
-    for k, parent in enumerate(PARENTS):
-        assert same(member(new, k), member(states, parent))
+    for new, parent in zip(inherit(states, PARENTS, "full"), PARENTS, strict=True):
+        assert same(new, states[parent])
 
 
 def test_copy_of_weights_leaves_everyone_their_optimiser(states: Any) -> None:
     """Networks and targets are the parent's, moments and counter one's own."""
-    new = jax.device_get(copy_by(states, PARENTS, "weights"))
-    for k, parent in enumerate(PARENTS):
-        for part in states._fields:
-            source = parent if part in NETWORKS else k
-            assert same(member(getattr(new, part), k), member(getattr(states, part), source)), part
+    for k, new in enumerate(inherit(states, PARENTS, "weights")):
+        for part in states[k]._fields:
+            source = PARENTS[k] if part in NETWORKS else k
+            assert same(getattr(new, part), getattr(states[source], part)), part
 
 
 def test_copy_of_the_actor_starts_its_optimiser_anew(states: Any) -> None:
     """The parent's actor, as the target too, without moments; the critics are one's own."""
-    new = jax.device_get(copy_by(states, PARENTS, "actor"))
+    new = inherit(states, PARENTS, "actor")
     for k, parent in [(0, 1), (2, 0)]:
-        actor = member(states.actor, parent)
-        assert same(member(new.actor, k), actor)
-        assert same(member(new.target_actor, k), actor)
-        assert not any(np.any(x) for x in jax.tree.leaves(member(new.actor_optimizer, k)))
+        assert same(new[k].actor, states[parent].actor)
+        assert same(new[k].target_actor, states[parent].actor)
+        assert not any(np.any(x) for x in jax.tree.leaves(new[k].actor_optimizer))
         for part in ("critic", "target_critic", "critic_optimizer", "updates"):
-            assert same(member(getattr(new, part), k), member(getattr(states, part), k))
-    assert same(member(new, 1), member(states, 1))  # the winner itself is left as it is
+            assert same(getattr(new[k], part), getattr(states[k], part))
+    assert same(new[1], states[1])  # the winner itself is left as it is
 
 
 @pytest.mark.parametrize("copy", ["full", "weights", "actor"])
 def test_copying_does_not_depend_on_names(copy: str, states: Any) -> None:
-    """Renaming members before or after the copy gives the same states."""
+    """Renaming members before or after the copy gives the same states; nobody shares a buffer."""
+    copied = inherit(states, PARENTS, copy)
     for names in permutations(range(3)):
         order = np.array(names)
         renamed = np.argsort(order)[PARENTS[order]]
-        one = jax.device_get(copy_by(jax.tree.map(lambda x, o=order: x[o], states), renamed, copy))
-        other = jax.device_get(copy_by(states, PARENTS, copy))
-        assert same(one, jax.tree.map(lambda x, o=order: x[o], other))
+        one = inherit([states[k] for k in order], renamed, copy)
+        assert same(one, [copied[k] for k in order])
+    buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves(copied)]
+    assert len(set(buffers)) == len(buffers)
 
 
 # Counting.
@@ -274,7 +273,7 @@ def test_waiting_members_neither_step_nor_learn(runs: Path) -> None:
         old, steps = steps, [each.steps for each in trainer.progress.members]
         for k in (0, 1):
             if steps[k] == old[k]:
-                assert same(member(before, k), member(after, k))
+                assert same(before[k], after[k])
                 rests += 1
 
     trainer.ensemble.learn = watched
@@ -282,7 +281,8 @@ def test_waiting_members_neither_step_nor_learn(runs: Path) -> None:
     assert steps == [33, 92]
     assert rests >= 60
     owed = [each.owed for each in trainer.progress.members]
-    np.testing.assert_array_equal(np.asarray(trainer.ensemble.states.updates) + owed, steps)
+    updates = [int(state.updates) for state in trainer.ensemble.states]
+    np.testing.assert_array_equal(np.add(updates, owed), steps)
 
 
 def test_counting_each_member(runs: Path) -> None:
@@ -363,7 +363,7 @@ def test_rule_none_copies_nobody_and_evaluates_all(runs: Path) -> None:
     assert all(row["parents"] == [0, 1] for row in rows if row["kind"] == "select")
     states = jax.device_get(trainer.ensemble.states)
     for part in NETWORKS:
-        assert all_differ(*(member(getattr(states, part), k) for k in (0, 1)))
+        assert all_differ(*(getattr(state, part) for state in states))
 
 
 # What members share, and what keeps them apart.
@@ -375,7 +375,7 @@ def test_members_begin_apart(runs: Path) -> None:
     with until(trainer, "eval"):
         states = jax.device_get(trainer.ensemble.states)
     for part in NETWORKS:
-        assert all_differ(*(member(getattr(states, part), k) for k in (0, 1)))
+        assert all_differ(*(getattr(state, part) for state in states))
 
 
 def test_clones_do_not_stay_clones(runs: Path) -> None:
@@ -383,22 +383,22 @@ def test_clones_do_not_stay_clones(runs: Path) -> None:
     trainer = start(runs, same_init=True, rule="none", target_noise=0.0, steps=20)
     update, batches = trainer.ensemble.population.update, []
 
-    def watched(states: Any, ready: Any, rows: Any, *rest: Any) -> Any:
+    def watched(state: Any, member: int, tick: int, rows: Any, *rest: Any) -> Any:
         batches.append(rows)
-        return update(states, ready, rows, *rest)
+        return update(state, member, tick, rows, *rest)
 
     trainer.ensemble.population.update = watched
     with until(trainer, "eval"):
         states = jax.device_get(trainer.ensemble.states)
-        assert same(member(states, 0), member(states, 1))
+        assert same(*states)
     trainer = Trainer.resume(trainer.directory.path)
     trainer.ensemble.population.update = watched
     run_to_end(trainer)
-    assert len(batches) == 5
-    assert all(not np.array_equal(rows[0], rows[1]) for rows in batches)
+    assert len(batches) == 10
+    assert not any(np.array_equal(*pair) for pair in zip(batches[::2], batches[1::2], strict=True))
     states = jax.device_get(trainer.ensemble.states)
     for part in NETWORKS:
-        assert all_differ(*(member(getattr(states, part), k) for k in (0, 1)))
+        assert all_differ(*(getattr(state, part) for state in states))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])
@@ -408,12 +408,12 @@ def test_clones_on_one_minibatch_part_by_their_keys(
     """The same rows for both: equal without target noise, apart with it."""
     trainer = start(runs, same_init=True, target_noise=noise)
     ensemble = trainer.ensemble
-    rows = np.stack([rng.normal(size=(2, 16, ensemble.columns.width)).astype(np.float32)] * 2)
-    statistics = ensemble.statistics
-    states = ensemble.population.update(ensemble.states, [0, 1], rows, None, statistics, [0, 0])
-    states = jax.device_get(states.states)
+    rows = rng.normal(size=(2, 16, ensemble.columns.width)).astype(np.float32)
+    update, statistics = ensemble.population.update, ensemble.statistics
+    moved = [update(ensemble.states[k], k, 0, rows, None, statistics).state for k in (0, 1)]
+    moved = jax.device_get(moved)
     trainer.close()
-    assert same(member(states, 0), member(states, 1)) == (noise == 0)
+    assert same(*moved) == (noise == 0)
 
 
 class Told(NamedTuple):
@@ -444,6 +444,9 @@ class KeyTeller:
         seen = jnp.concatenate([batch.observation, batch.next_observation], axis=-1)
         return Update(Told(jax.random.key_data(key)), {"loss": jnp.zeros(())}, seen)
 
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        return {}
+
     def policy(self, state: Told) -> Any:
         raise NotImplementedError
 
@@ -452,31 +455,28 @@ STILL = np.zeros(3, np.float32), np.ones(3, np.float32)
 
 
 def test_no_two_draws_of_a_run_share_a_key() -> None:
-    """Every member's init and every cycle of it; one alone draws the same as among all."""
+    """Every member's init and every cycle of it."""
     columns = Columns(*SPEC)
-    population = Population(KeyTeller(), columns, 3, seed=0, normalize=False)
-    rows = np.zeros((3, 1, 1, columns.width), np.float32)
-    states = population.init(same=False)
-    told = [np.asarray(states.key)]
+    population = Population(KeyTeller(), columns, seed=0, normalize=False)
+    rows = np.zeros((1, 1, columns.width), np.float32)
+    states = population.init(3, same=False)
+    told = [tuple(np.asarray(state.key)) for state in states]
     for cycle in range(5):
-        copied = jax.tree.map(jnp.copy, states)
-        alone = population.update(copied, [1], rows[:1], None, STILL, [cycle]).states
-        states = population.update(states, [0, 1, 2], rows, None, STILL, [cycle] * 3).states
-        told.append(np.asarray(states.key))
-        np.testing.assert_array_equal(alone.key[1], states.key[1])
-    keys = {tuple(key) for part in told for key in part.tolist()}
-    assert len(keys) == 3 * (1 + 5)
+        for k, state in enumerate(states):
+            states[k] = population.update(state, k, cycle, rows, None, STILL).state
+        told += [tuple(np.asarray(state.key)) for state in states]
+    assert len(set(told)) == len(told) == 3 * (1 + 5)
 
 
 def test_members_learn_from_observations_as_they_act_on_them(rng: np.random.Generator) -> None:
     """Raw rows are scaled for the learner as an observation is for acting, cut at +-10."""
     columns = Columns(*SPEC)
-    population = Population(KeyTeller(), columns, 3, seed=0, normalize=True)
-    rows = rng.normal(size=(3, 1, 1, columns.width), scale=20).astype(np.float32)
+    population = Population(KeyTeller(), columns, seed=0, normalize=True)
+    rows = rng.normal(size=(1, 3, columns.width), scale=20).astype(np.float32)
     statistics = np.array([3, -2, 0], np.float32), np.array([2, 0.5, 7], np.float32)
-    states = population.init(same=True)
-    seen = population.update(states, [0, 1, 2], rows, None, statistics, [0] * 3).error[:, 0, 0]
-    batch = columns.unpack(rows[:, 0, 0], None)
+    (state,) = population.init(1, same=True)
+    seen = np.asarray(population.update(state, 0, 0, rows, None, statistics).error[0])
+    batch = columns.unpack(rows[0], None)
     raw = np.stack([batch.observation, batch.next_observation], axis=1)
     assert np.abs(seen).max() == 10
     np.testing.assert_allclose(seen.reshape(3, 2, 3), normalize(raw, *statistics), rtol=1e-6)
@@ -498,14 +498,10 @@ def test_members_learn_from_the_rows_of_their_scope(runs: Path) -> None:
         update, seen = trainer.ensemble.population.update, set()
 
         def watched(
-            states: Any, ready: Any, rows: Any, *rest: Any, to: Any = update, into: Any = seen
+            state: Any, k: int, tick: int, rows: Any, *rest: Any, to: Any = update, into: Any = seen
         ) -> Any:
-            into |= {
-                (k, mark)
-                for k, part in zip(ready, rows, strict=True)
-                for mark in part[..., 0].ravel()
-            }
-            return to(states, ready, rows, *rest)
+            into |= {(k, mark) for mark in rows[..., 0].ravel()}
+            return to(state, k, tick, rows, *rest)
 
         trainer.ensemble.population.update = watched
         run_to_end(trainer)
@@ -584,6 +580,6 @@ def test_the_seed_decides_everything(runs: Path) -> None:
     )
     assert_same(first, again)
     assert not same(
-        content(first)["arrays"]["states.actor.0.kernel"],
-        content(other)["arrays"]["states.actor.0.kernel"],
+        content(first)["arrays"]["states.0.actor.0.kernel"],
+        content(other)["arrays"]["states.0.actor.0.kernel"],
     )

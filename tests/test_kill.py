@@ -280,12 +280,12 @@ def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:
 
 def poison(trainer: Trainer, field: str, member: int, value: float) -> None:
     """Put a number into the first array of a part of one member's state."""
-    part = getattr(trainer.ensemble.states, field)
-    leaves, structure = jax.tree.flatten(part)
-    place = next(i for i, leaf in enumerate(leaves) if leaf.dtype == np.float32)
-    leaves[place] = leaves[place].at[(member, *[0] * (leaves[place].ndim - 1))].set(value)
     states = trainer.ensemble.states
-    trainer.ensemble.states = states._replace(**{field: jax.tree.unflatten(structure, leaves)})
+    leaves, structure = jax.tree.flatten(getattr(states[member], field))
+    place = next(i for i, leaf in enumerate(leaves) if leaf.dtype == np.float32)
+    leaves[place] = leaves[place].at[(0,) * leaves[place].ndim].set(value)
+    part = jax.tree.unflatten(structure, leaves)
+    states[member] = states[member]._replace(**{field: part})
 
 
 def at_step(trainer: Trainer, step: int, do: Callable[[], object]) -> None:
@@ -328,11 +328,11 @@ def test_fault_in_a_loss(
     population = trainer.ensemble.population
     update = population.update
 
-    def broken(*arguments: Any) -> Any:
-        result = update(*arguments)
+    def broken(state: Any, member: int, *rest: Any) -> Any:
+        result = update(state, member, *rest)
         losses = np.array(result.losses)
-        if trainer.progress.step == 600:
-            losses[1, 0] = np.inf
+        if trainer.progress.step == 600 and member == 1:
+            losses[0] = np.inf
         return result._replace(losses=losses)
 
     monkeypatch.setattr(population, "update", broken)

@@ -34,7 +34,7 @@ def learn(algorithm: str, env: str, runs: Path, **kwargs: Any) -> Trainer:
 
 def values(trainer: Trainer, observation: float, actions: Any = (-0.8, 0.0, 0.8)) -> Any:
     """Every critic's value (critics, actions) of actions in [-1, 1]."""
-    critic = jax.device_get(jax.tree.map(lambda x: x[0], trainer.ensemble.states.critic))
+    critic = jax.device_get(trainer.ensemble.states[0].critic)
     action = np.array(actions, np.float32)[:, None]
     algorithm: Any = trainer.ensemble.algorithm
     return jax.jit(algorithm.values)(critic, np.full_like(action, observation), action)

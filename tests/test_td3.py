@@ -63,11 +63,10 @@ def learner(name: str = "td3", spec: Spec = SPEC, **hyper: Any) -> TD3:
     return kind.build(spec, kind.Hyper(**{"hidden": (12, 10), **hyper}))
 
 
-def fresh(algorithm: TD3, seed: int = 0, members: int = 0) -> State:
+def fresh(algorithm: TD3, seed: int = 0) -> State:
     """A state with random networks, targets unlike them, and an optimiser that has not moved."""
     rng = np.random.default_rng(seed)
-    start = jax.vmap(algorithm.init) if members else algorithm.init
-    shapes = jax.eval_shape(start, jax.random.split(KEY, members) if members else KEY)
+    shapes = jax.eval_shape(algorithm.init, KEY)
     zero = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
 
     def draw(x: Any) -> Any:
@@ -667,4 +666,4 @@ def test_nothing_is_nan(name: str, settings: dict[str, Any], runs: Path) -> None
     with jax.debug_nans(True):
         trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
         assert run_to_end(trainer).rows()[-1]["step"] == 80
-    assert np.all(np.asarray(trainer.ensemble.states.updates) >= 20)
+    assert all(state.updates >= 20 for state in trainer.ensemble.states)

@@ -70,7 +70,7 @@ class Algorithm(Protocol):
         ...
 
     def acting(self, state: State) -> Any:
-        """The part of a state that acting needs; no more than chosen, since states are stacked."""
+        """The part of a state that acting needs, which is copied to NumPy after every update."""
         ...
 
     def begin(self, acting: Any, rng: np.random.Generator) -> Memory:
@@ -89,6 +89,12 @@ class Algorithm(Protocol):
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         """One cycle of U updates."""
+        ...
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        """What so many updates and chosen actions cost beyond themselves, for every row's ledger;
+        most learners have nothing to add.
+        """
         ...
 
     def policy(self, state: State) -> Actors:

@@ -111,6 +111,9 @@ class SAC:
         state, losses = self.fit_actor(state, minibatch, actor_key)
         return Update(state, {"critic_loss": critic_loss, **losses}, error[None])
 
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        return {}
+
     def policy(self, state: State) -> Actors:
         """The deterministic action is the tanh of the mean."""
         size = self.spec.action_size

@@ -118,6 +118,9 @@ class TD3:
         state, actor_loss = self.fit_actor(state, jax.tree.map(lambda x: x[-1], batch))
         return Update(state, {"critic_loss": losses.mean(), "actor_loss": actor_loss}, error)
 
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        return {}
+
     def policy(self, state: State) -> Actors:
         one = jax.tree.map(lambda x: x[None], state.actor)
         return Actors(one, activation="relu", output="tanh")

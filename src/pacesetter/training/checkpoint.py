@@ -15,7 +15,7 @@ from pacesetter.training.ensemble import Ensemble
 from pacesetter.training.progress import Progress
 
 KIND = "checkpoint"
-SCHEMA = 1
+SCHEMA = 2
 
 
 def save(ensemble: Ensemble, directory: RunDirectory) -> None:
@@ -146,6 +146,6 @@ def _identity(ensemble: Ensemble) -> dict[str, Any]:
 def _refuse_faults(arrays: Arrays, step: int) -> None:
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            member = int(np.argwhere(~np.isfinite(array))[0][0])
-            where = f"member {member}, " if name.startswith("states.") else ""
+            part, member, *_ = [*name.split("."), ""]
+            where = f"member {member}, " if part == "states" else ""
             raise TrainingError(f"{where}step {step}: {name} is not finite")

@@ -18,13 +18,14 @@ from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts
 from pacesetter.policy import Floats, Policy, clip, normalize, unstack
-from pacesetter.rules import RULES
+from pacesetter.rules import Parents
 from pacesetter.seeding import Stream, generator
+from pacesetter.training import selection as selections
 from pacesetter.training.normalizer import Normalizer, Statistics
-from pacesetter.training.population import Population
+from pacesetter.training.population import Cycle, Population, inherit
 from pacesetter.training.progress import Member, Progress
-from pacesetter.training.replay import Columns, Replay
-from pacesetter.training.selection import Selection, measure
+from pacesetter.training.replay import Columns, Replay, Sample
+from pacesetter.training.selection import Selection
 
 
 class Ensemble:
@@ -36,12 +37,10 @@ class Ensemble:
         spec = Spec(first.observation_size, first.action_size)
         self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
         self.columns = columns = Columns(*spec, len(self.algorithm.mask(generator(0, Stream.MASK))))
-        self.population = Population(
-            self.algorithm, columns, run.members, run.seed, hyper.normalize_observation
-        )
-        self.states = self.population.init(run.same_init)
+        self.population = Population(self.algorithm, columns, run.seed, hyper.normalize_observation)
+        self.states = self.population.init(run.members, run.same_init)
         self.acting = self.population.acting(self.states)
-        self.loss_names = self.population.loss_names(self.states)
+        self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps * config.unit
         self.replays: list[Replay] = []
@@ -79,6 +78,18 @@ class Ensemble:
         self.progress.tick += 1
         return selection
 
+    def trial(self, k: int) -> list[float]:
+        """Returns of noise-free episodes of a member, from the starts of this selection."""
+        run, progress = self.config.run, self.progress
+        if self.trial_env is None:
+            self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
+        first, left = progress.selections * run.select_window, self.budget - progress.step
+        with blame(k, progress.step):
+            act = self.policy(k).act
+            trial = rollouts(act, self.trial_env, run.select_window, first, limit=left)
+        progress.selection_steps += sum(trial.lengths)
+        return trial.returns
+
     def close(self) -> None:
         """Let go of envs and files."""
         for env in (*self.envs, self.trial_env):
@@ -92,10 +103,15 @@ class Ensemble:
         """What observations are normalised by, now."""
         return self.normalizer.statistics()
 
+    def ledger(self) -> dict[str, Any]:
+        """What the run has spent."""
+        progress = self.progress
+        actions = sum(member.actions for member in progress.members)
+        return progress.ledger() | self.algorithm.ledger(progress.updates, actions)
+
     def policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
-        state = jax.tree.map(lambda x: x[member], self.states)
-        actors, env = self.algorithm.policy(state), self.envs[0]
+        actors, env = self.algorithm.policy(self.states[member]), self.envs[0]
         statistics = self.statistics if self.population.normalize else None
         layers = unstack(actors)
         return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
@@ -134,6 +150,7 @@ class Ensemble:
             observation = normalize(observation, *self.statistics)
         acting, memory = self.acting[k], self.memory[k]
         action, self.memory[k] = self.algorithm.act(acting, memory, observation, rng)
+        self.progress.members[k].actions += 1
         return action
 
     def _step(self, k: int, action: Floats) -> None:
@@ -172,36 +189,33 @@ class Ensemble:
             self._update(members)
 
     def _update(self, members: list[int]) -> None:
-        progress, cycle = self.progress, self.algorithm.cycle
-        shape = (cycle, self.config.hyper.batch_size)
-        samples = [self.replay(k).sample(self.sample_streams[k], shape) for k in members]
-        weights = [sample.weight for sample in samples if sample.weight is not None]
-        result = self.population.update(
-            self.states,
-            members,
-            np.stack([sample.rows for sample in samples]),
-            np.stack(weights) if weights else None,
-            self.statistics,
-            [progress.members[k].cycles for k in members],
-        )
-        self.states = result.states
-        self._check(members, result.losses)
-        progress.note(result.losses)
-        for place, k in enumerate(members):
-            self.replay(k).feedback(samples[place].slots, result.error[place])
-            self.acting[k] = result.acting[place]
-            progress.members[k].owed -= cycle
-            progress.members[k].cycles += 1
-        progress.updates += cycle * len(members)
-        progress.transitions += len(members) * shape[0] * shape[1]
+        """All members' cycles are sent off before the first result is waited for."""
+        cycles = [self._cycle(k) for k in members]
+        for k, (sample, cycle) in zip(members, cycles, strict=True):
+            losses = np.asarray(cycle.losses)
+            self._check(k, losses)
+            self.progress.note(losses)
+            self.replay(k).feedback(sample.slots, np.asarray(cycle.error))
+            self.acting[k] = jax.tree.map(np.asarray, cycle.acting)
 
-    def _check(self, members: list[int], losses: Floats) -> None:
-        if not np.isfinite(losses).all():
-            place, column = np.argwhere(~np.isfinite(losses))[0]
-            raise TrainingError(
-                f"member {members[place]}, step {self.progress.step}: "
-                f"{self.loss_names[column]} is {losses[place, column]}"
-            )
+    def _cycle(self, k: int) -> tuple[Sample, Cycle]:
+        progress, cycle = self.progress, self.algorithm.cycle
+        member, shape = progress.members[k], (cycle, self.config.hyper.batch_size)
+        sample = self.replay(k).sample(self.sample_streams[k], shape)
+        result = self.population.update(
+            self.states[k], k, member.cycles, sample.rows, sample.weight, self.statistics
+        )
+        self.states[k] = result.state
+        member.owed -= cycle
+        member.cycles += 1
+        progress.updates += cycle
+        progress.transitions += shape[0] * shape[1]
+        return sample, result
+
+    def _check(self, k: int, losses: Floats) -> None:
+        for name, loss in zip(self.loss_names, losses, strict=True):
+            if not np.isfinite(loss):
+                raise TrainingError(f"member {k}, step {self.progress.step}: {name} is {loss}")
 
     # Turn.
 
@@ -212,65 +226,18 @@ class Ensemble:
         over = len(ended) == run.members if run.wait else bool(ended)
         selection = None
         if run.members > 1 and run.select_on == "eval":
-            selection = self._select_on_trials()
+            selection = selections.on_trials(self)
         elif run.members > 1 and over:
-            selection = self._select_on_training()
+            selection = selections.on_training(self)
         if over:
             for member in ended:
                 member.starting = True
         return selection
 
-    def _select_on_training(self) -> Selection | None:
-        window, members = self.config.run.select_window, self.progress.members
-        if min(len(member.window) for member in members) < window:
-            return None
-        returns = np.array([member.window[-window:] for member in members])
-        for member in members:
-            member.window = []
-        return self._select(returns)
-
-    def _select_on_trials(self) -> Selection | None:
-        """Extra noise-free episodes with the same starts for each member; their steps count."""
-        run, progress = self.config.run, self.progress
-        if progress.step <= self.config.hyper.warmup or progress.step < progress.next_selection:
-            return None
-        every = run.select_every * self.config.unit
-        returns = [self._trial(k) for k in range(run.members)]
-        progress.next_selection = (progress.step // every + 1) * every
-        # A selection that the budget cut short decides nothing.
-        return self._select(np.array(returns)) if progress.step < self.budget else None
-
-    def _trial(self, k: int) -> list[float]:
-        run, progress = self.config.run, self.progress
-        if self.trial_env is None:
-            self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
-        first, left = progress.selections * run.select_window, self.budget - progress.step
-        with blame(k, progress.step):
-            act = self.policy(k).act
-            trial = rollouts(act, self.trial_env, run.select_window, first, limit=left)
-        progress.selection_steps += sum(trial.lengths)
-        return trial.returns
-
-    def _select(self, returns: Any) -> Selection:
-        """Copy by the rule's choice from returns (K, episodes); the winner is the champion."""
-        run, progress = self.config.run, self.progress
-        means = returns.mean(axis=1)
-        parents = RULES[run.rule](means, self.rule_stream)
-        if run.rule != "none":
-            self.states = self.population.inherit(self.states, parents, run.copy)
-            self.acting = self.population.acting(self.states)
-            progress.champion = champion(means, parents)
-        progress.selections += 1
-        gap, error = measure(returns, progress.variances)
-        return Selection(parents.tolist(), progress.champion, returns.tolist(), gap, error)
-
-
-def champion(means: Any, parents: Any) -> int:
-    """The best member that went on from itself; if none did, the place of the best parent."""
-    themselves = np.flatnonzero(parents == np.arange(len(parents)))
-    if len(themselves):
-        return int(themselves[np.argmax(means[themselves])])
-    return int(np.argmax(means[parents]))
+    def descend(self, parents: Parents) -> None:
+        """Every member starts again from its parent."""
+        self.states = inherit(self.states, parents, self.config.run.copy)
+        self.acting = self.population.acting(self.states)
 
 
 class blame:  # noqa: N801 (a context manager reads as a verb)

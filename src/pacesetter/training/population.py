@@ -1,11 +1,12 @@
-"""One member's learner lifted over K members: the only place that knows the member axis of states.
+"""One learner compiled once and called for each of K members, whose states are a plain list.
 
+On a CPU one call a member is as fast as one call for all: the cores share each matrix product.
 Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
 so a waiting member shifts nobody's stream and no state ever holds a key.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,137 +28,72 @@ class Draw(IntEnum):
 
 
 class Cycle(NamedTuple):
-    """What a cycle of the ready members gave."""
+    """What a cycle of one member gave; arrays may still be under way until NumPy reads them."""
 
-    states: State  # of all members
-    losses: Floats  # (ready, losses)
-    error: Floats  # (ready, U, B)
-    acting: list[Any]  # what each ready member acts with now
+    state: State
+    losses: Array  # (losses,)
+    error: Array  # (U, B)
+    acting: Any  # what it acts with now
 
 
 class Population:
-    """Compiled functions over states whose leaves carry a leading axis of K members."""
+    """The compiled functions of one algorithm: the same program for every member and seed."""
 
-    def __init__(
-        self,
-        algorithm: Algorithm,
-        columns: Columns,
-        members: int,
-        seed: int,
-        normalize: bool,
-    ) -> None:
-        self.algorithm, self.columns, self.members = algorithm, columns, members
-        self.normalize = normalize
+    def __init__(self, algorithm: Algorithm, columns: Columns, seed: int, normalize: bool) -> None:
+        self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
         self.key = jax.random.key(seed)
-        self._init = jax.jit(self._init_all)
+        self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
         self._acting = jax.jit(algorithm.acting)
-        self._update = jax.jit(self._update_all, donate_argnums=0)
-        self._update_one = jax.jit(self._update_single, donate_argnums=0)
-        self._inherit = jax.jit(inherit, static_argnums=2)
+        self._update = jax.jit(self._update_one, donate_argnums=0)
 
-    def init(self, same: bool) -> State:
+    def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""
-        members = jnp.zeros(self.members, int) if same else jnp.arange(self.members)
-        return self._init(self.key, members)
+        return [self._init(self.key, 0 if same else member) for member in range(members)]
 
-    def acting(self, states: State) -> list[Any]:
-        """What each member acts with, as NumPy copies."""
-        return self._each(self._acting(states))
+    def acting(self, states: Sequence[State]) -> list[Any]:
+        """What each member acts with, as NumPy arrays that no later update touches."""
+        return [jax.tree.map(np.array, self._acting(state)) for state in states]
 
     def update(
         self,
-        states: State,
-        ready: list[int],
+        state: State,
+        member: int,
+        tick: int,
         rows: Floats,
         weight: Floats | None,
         statistics: Statistics,
-        ticks: list[int],
     ) -> Cycle:
-        """One cycle of each ready member on its own rows (ready, U, B, width).
+        """One cycle of a member on rows (U, B, width); the given state is used up.
 
-        All members at once, or one after the other: two programs, compiled once, for any K.
+        The call returns at once; several members' cycles follow each other without a pause.
         """
-        if len(ready) == self.members:
-            states, losses, error, acting = self._update(
-                states, rows, weight, statistics, self.key, np.array(ticks, np.uint32)
-            )
-            return Cycle(states, np.asarray(losses), np.asarray(error), self._each(acting))
-        parts: list[Any] = []
-        for place, member in enumerate(ready):
-            weights = None if weight is None else weight[place]
-            states, *part = self._update_one(
-                states, member, rows[place], weights, statistics, self.key, ticks[place]
-            )
-            parts.append(part)
-        losses, errors, acting = zip(*parts, strict=True)
-        return Cycle(
-            states,
-            np.stack(losses),
-            np.stack(errors),
-            [jax.tree.map(np.asarray, part) for part in acting],
-        )
+        return Cycle(*self._update(state, member, tick, rows, weight, statistics, self.key))
 
-    def inherit(self, states: State, parents: Parents, copy: str) -> State:
-        """States in which each member starts again from its parent."""
-        return self._inherit(states, parents, copy)
-
-    def loss_names(self, states: State) -> list[str]:
+    def loss_names(self, state: State) -> list[str]:
         """Names of the columns of losses, in order."""
-        members = jnp.arange(self.members)
-        rows = np.zeros((self.members, self.algorithm.cycle, 1, self.columns.width), np.float32)
+        rows = np.zeros((self.algorithm.cycle, 1, self.columns.width), np.float32)
         size = self.columns.observation
         batch = self._batch(rows, None, (np.zeros(size), np.ones(size)))
-        keys = _keys(self.key, Draw.UPDATE, members, members)
-        return sorted(jax.eval_shape(jax.vmap(self.algorithm.update), states, batch, keys).losses)
+        return sorted(jax.eval_shape(self.algorithm.update, state, batch, self.key).losses)
 
-    # Below: what is compiled. States, rows and so on as above; `key` is an argument so that the
-    # compiled program is the same for every seed.
+    # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
 
-    def _init_all(self, key: Array, members: Array) -> State:
-        return jax.vmap(self.algorithm.init)(
-            _keys(key, Draw.INIT, jnp.zeros_like(members), members)
-        )
-
-    def _update_all(
+    def _update_one(
         self,
-        states: State,
-        rows: Array,
-        weight: Array | None,
-        statistics: Any,
-        key: Array,
-        ticks: Array,
-    ) -> tuple[State, Array, Array, Any]:
-        keys = _keys(key, Draw.UPDATE, ticks, jnp.arange(self.members))
-        update = jax.vmap(self.algorithm.update)(
-            states, self._batch(rows, weight, statistics), keys
-        )
-        losses = jnp.stack([update.losses[name] for name in sorted(update.losses)], axis=-1)
-        return update.state, losses, update.error, self._apart(update.state)
-
-    def _update_single(
-        self,
-        states: State,
+        state: State,
         member: int,
+        tick: int,
         rows: Array,
         weight: Array | None,
         statistics: Any,
         key: Array,
-        tick: int,
     ) -> tuple[State, Array, Array, Any]:
-        state = jax.tree.map(lambda x: x[member], states)
         batch = self._batch(rows, weight, statistics)
         update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, tick, member))
-        states = jax.tree.map(lambda all, one: all.at[member].set(one), states, update.state)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
-        return states, losses, update.error, self._apart(update.state)
-
-    def _apart(self, state: State) -> Any:
-        """Buffers of their own: a state that NumPy looks into cannot be donated without a copy."""
-        return jax.tree.map(jnp.copy, self.algorithm.acting(state))
-
-    def _each(self, acting: Any) -> list[Any]:
-        arrays = jax.tree.map(np.asarray, acting)
-        return [jax.tree.map(lambda x, k=k: x[k], arrays) for k in range(self.members)]
+        # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
+        acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
+        return update.state, losses, update.error, acting
 
     def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
         batch = self.columns.unpack(rows, weight)
@@ -173,36 +109,32 @@ class Population:
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-def inherit(states: Any, parents: Array, copy: str) -> Any:
-    """Each member's new state: `full` copies all of its parent's, `weights` leaves it its own
-    optimiser, `actor` gives it the parent's actor, as its target too, with fresh Adam moments.
+def inherit(states: Sequence[Any], parents: Parents, copy: str) -> list[Any]:
+    """Each member's new state; who is its own parent goes on as it is. Of another parent, `full`
+    copies everything, `weights` leaves a member its own optimiser, and `actor` gives it only the
+    parent's actor, as its target too, with fresh Adam moments.
     """
-    taken = jax.tree.map(lambda x: x[parents], states)
+    return [
+        own if parent == member else _descend(own, states[parent], copy)
+        for member, (own, parent) in enumerate(zip(states, parents, strict=True))
+    ]
+
+
+def _descend(own: Any, parent: Any, copy: str) -> Any:
     if copy == "full":
-        return taken
-    if copy == "weights":
-        own = [f for f in states._fields if f.endswith("_optimizer") or f == "updates"]
-        new = taken._replace(**{field: getattr(states, field) for field in own})
+        new = parent
+    elif copy == "weights":
+        kept = [f for f in own._fields if f.endswith("_optimizer") or f == "updates"]
+        new = parent._replace(**{field: getattr(own, field) for field in kept})
     else:
-        fresh = jax.tree.map(jnp.zeros_like, states.actor_optimizer)
-        new = states._replace(actor=taken.actor, actor_optimizer=fresh)
-        if "target_actor" in states._fields:
-            new = new._replace(target_actor=taken.actor)
-    stays = parents == jnp.arange(len(parents))
-    return jax.tree.map(
-        lambda own, copied: jnp.where(_column(stays, own), own, copied), states, new
-    )
-
-
-def _column(mask: Array, like: Array) -> Array:
-    return mask.reshape((-1,) + (1,) * (like.ndim - 1))
+        fresh = jax.tree.map(jnp.zeros_like, own.actor_optimizer)
+        new = own._replace(actor=parent.actor, actor_optimizer=fresh)
+        if "target_actor" in own._fields:
+            new = new._replace(target_actor=parent.actor)
+    return jax.tree.map(jnp.copy, new)  # updates use up their state, so no two may share a buffer
 
 
 def _key(key: Array, draw: Draw, tick: Any, member: Any) -> Array:
     for number in (int(draw), tick, member):
         key = jax.random.fold_in(key, number)
     return key
-
-
-def _keys(key: Array, draw: Draw, ticks: Any, members: Any) -> Array:
-    return jax.vmap(partial(_key, key, draw))(ticks, members)

@@ -13,6 +13,7 @@ class Member:
     """One member's counters and the episode it is in."""
 
     steps: int = 0
+    actions: int = 0  # of its steps, those that its learner chose
     cycles: int = 0  # calls of `update` it has made
     owed: float = 0.0  # critic updates that have fallen due
     active: bool = True  # False while it waits for the others to end their episodes
@@ -86,10 +87,10 @@ class Progress:
         return asdict(self)
 
     def note(self, losses: Any) -> None:
-        """Add losses (members, losses) to what the next row averages."""
-        sums = losses.sum(axis=0, dtype=float).tolist()
-        self.losses = [a + b for a, b in zip(self.losses or [0.0] * len(sums), sums, strict=True)]
-        self.updated += len(losses)
+        """Add the losses of one cycle to what the next row averages."""
+        before = self.losses or [0.0] * len(losses)
+        self.losses = [a + b for a, b in zip(before, losses.tolist(), strict=True)]
+        self.updated += 1
 
     def training_values(self, loss_names: list[str]) -> dict[str, Any]:
         """Episodes ended as [member, return, length] and mean losses since the last row."""

@@ -1,10 +1,18 @@
-"""One selection and how sure it was: the gap between members and the standard error of that gap."""
+"""Who sets the pace: selections on training episodes or on extra trials, and how sure each was."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pacesetter.rules import RULES, Parents
+
+if TYPE_CHECKING:
+    from pacesetter.training.ensemble import Ensemble
+
+Returns = NDArray[np.float64]
 REMEMBERED = 20
 
 
@@ -18,7 +26,7 @@ class Selection(NamedTuple):
     standard_error: float
 
 
-def measure(returns: NDArray[np.float64], variances: list[float]) -> tuple[float, float]:
+def measure(returns: Returns, variances: list[float]) -> tuple[float, float]:
     """Best mean return minus the next, and the standard error of such a difference.
 
     With n > 1 episodes a member, the variance is that of a member's own episodes. With one, it is
@@ -33,3 +41,47 @@ def measure(returns: NDArray[np.float64], variances: list[float]) -> tuple[float
     del variances[:-REMEMBERED]
     error = float(np.sqrt(2 * np.mean(variances) / episodes))
     return float(means[-1] - means[-2]), error
+
+
+def on_training(ensemble: Ensemble) -> Selection | None:
+    """Select on the training episodes since the last selection, once each member has enough."""
+    window, members = ensemble.config.run.select_window, ensemble.progress.members
+    if min(len(member.window) for member in members) < window:
+        return None
+    returns = np.array([member.window[-window:] for member in members])
+    for member in members:
+        member.window = []
+    return _select(ensemble, returns)
+
+
+def on_trials(ensemble: Ensemble) -> Selection | None:
+    """Select on extra noise-free episodes with the same starts for each; their steps count."""
+    config, progress = ensemble.config, ensemble.progress
+    if progress.step <= config.hyper.warmup or progress.step < progress.next_selection:
+        return None
+    every = config.run.select_every * config.unit
+    returns = [ensemble.trial(k) for k in range(config.run.members)]
+    progress.next_selection = (progress.step // every + 1) * every
+    # A selection that the budget cut short decides nothing.
+    return _select(ensemble, np.array(returns)) if progress.step < ensemble.budget else None
+
+
+def _select(ensemble: Ensemble, returns: Returns) -> Selection:
+    """Copy by the rule's choice from returns (K, episodes); the winner is the champion."""
+    run, progress = ensemble.config.run, ensemble.progress
+    means = returns.mean(axis=1)
+    parents = RULES[run.rule](means, ensemble.rule_stream)
+    if run.rule != "none":
+        ensemble.descend(parents)
+        progress.champion = champion(means, parents)
+    progress.selections += 1
+    gap, error = measure(returns, progress.variances)
+    return Selection(parents.tolist(), progress.champion, returns.tolist(), gap, error)
+
+
+def champion(means: Returns, parents: Parents) -> int:
+    """The best member that went on from itself; if none did, the place of the best parent."""
+    themselves = np.flatnonzero(parents == np.arange(len(parents)))
+    if len(themselves):
+        return int(themselves[np.argmax(means[themselves])])
+    return int(np.argmax(means[parents]))

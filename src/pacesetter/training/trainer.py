@@ -239,7 +239,7 @@ class Trainer:
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
-        report = Report(kind, self.progress.step, values, self.progress.ledger())
+        report = Report(kind, self.progress.step, values, self.ensemble.ledger())
         self.directory.append(report.row())
         self._reports.append(report)
 
