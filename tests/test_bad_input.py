@@ -417,7 +417,7 @@ def test_checkpoint_of_another_run(run: RunDirectory, refused: Refused) -> None:
     arrays["states.0.actor.0.bias"] = arrays["states.0.actor.0.bias"][:8]
     storage.write(run.state_file, "checkpoint", storage.Content(arrays, table))
     run.previous_file.unlink()
-    words = ["state.safetensors", "does not fit", "actor.0.bias", "(1, 8)", "(1, 16)"]
+    words = ["state.safetensors", "does not fit", "actor.0.bias", "(8,)", "(16,)"]
     says(refused("resume", run.path), words)
 
 
