@@ -1,0 +1,151 @@
+"""What a run spends beside its updates: outside time, members, checkpoints, memory, start-up.
+
+    python benchmarks/costs.py outside members checkpoint startup
+    python benchmarks/costs.py memory        15 minutes: a full replay of 1M rows, then 200k updates
+
+Each line names its target. Nothing else should run on the machine meanwhile.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+import jax
+import numpy as np
+from ceiling import SPECS, timed, whole
+
+from pacesetter import Trainer
+
+ENV = "HalfCheetah-v5"
+MEGA = 1e6
+QUIET: dict[str, Any] = {"eval_every": 10**9, "eval_episodes": 1}
+FIRST_STEP = """
+from pacesetter import Trainer
+trainer = Trainer("td3", "HalfCheetah-v5", runs="runs")
+trainer.ensemble.tick()
+"""
+
+
+def outside(folder: str) -> None:
+    """Share of a run's time that is not spent in updates, drawing of batches counted as outside."""
+    trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1000, **QUIET)
+    ensemble, spent, marks = trainer.ensemble, [0.0], []
+
+    def watched(work: Callable[..., Any], sign: int) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            began = perf_counter()
+            try:
+                return work(*arguments)
+            finally:
+                spent[0] += sign * (perf_counter() - began)
+
+        return call
+
+    ensemble.learn = watched(ensemble.learn, 1)
+    ensemble.replays[0].sample = watched(ensemble.replays[0].sample, -1)
+    for report in trainer:
+        if report.kind == "train" and report.step >= 2000:
+            marks.append((perf_counter(), spent[0]))
+        if report.step >= 7000:
+            break
+    whole_time, updating = (b - a for a, b in zip(marks[0], marks[-1], strict=True))
+    print(f"outside the update: {1 - updating / whole_time:.3f} of a run (target 0.08 at most)")
+
+
+def members(folder: str) -> None:
+    """Member updates/s of K members over those of one, alternating."""
+    cycles = {k: whole("td3", SPECS[ENV], k) for k in (1, 2, 5, 10)}
+    rates: dict[int, list[float]] = {k: [] for k in cycles}
+    for call, *_ in cycles.values():
+        call()
+    for _ in range(9):
+        for k, (call, _, updates) in cycles.items():
+            rates[k].append(updates / timed(call, 40 // k))
+    for k, found in rates.items():
+        ratio = median(a / b for a, b in zip(found, rates[1], strict=True))
+        print(
+            f"{k} members: {median(found):.0f} member updates/s, {ratio:.3f} x one's (target 0.95)"
+        )
+
+
+def checkpoint(folder: str) -> None:
+    """Share of a minute that its checkpoint takes, Humanoid, 1M rows in the replay."""
+    trainer = Trainer("td3", "Humanoid-v5", runs=folder, steps=10**7, **QUIET)
+    (replay,), rng = trainer.ensemble.replays, np.random.default_rng(0)
+    while replay.head < 1_000_000:
+        replay.rows[replay.head : replay.head + 25_000] = rng.random(replay.columns.width)
+        replay.head += 25_000
+        trainer.save()
+    took: list[float] = []
+    for _ in range(5):
+        replay.head += 12_000  # more than a minute's steps
+        began = perf_counter()
+        trainer.save()
+        took.append(perf_counter() - began)
+    trainer.close()
+    print(f"checkpoint: {median(took):.2f} s, {median(took) / 60:.4f} of a minute (target 0.01)")
+
+
+def memory(folder: str) -> None:
+    """Resident memory beyond the rows, replay full, and what 200k updates add to it."""
+    trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1_000_000, **QUIET)
+    full = 0.0
+    for report in trainer:
+        if report.kind == "train" and report.step == 1_002_000:
+            full = resident()
+            rows = trainer.ensemble.replays[0].columns.width * 4 * 1_000_000 / MEGA
+            print(f"memory: {full - rows:.0f} MB beyond {rows:.0f} MB of rows (target 700)")
+        if report.step >= 1_202_000:
+            break
+    print(f"memory: {resident() - full:+.0f} MB after 200k updates (target: flat)")
+
+
+def resident() -> float:
+    """Resident megabytes of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / MEGA
+
+
+def startup(folder: str) -> None:
+    """Seconds of a whole process: help, first env step with a cold and a warm compile cache."""
+    environment = os.environ | {"XDG_CACHE_HOME": folder}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+
+    def run(*command: str, name: str) -> float:
+        with TemporaryDirectory(dir=folder) as place:
+            began = perf_counter()
+            subprocess.run(command, env=environment, cwd=place, check=True, capture_output=True)
+            took = perf_counter() - began
+        print(f"{name} took {took:.2f} s", file=sys.stderr)
+        return took
+
+    python = sys.executable
+    aid = median(run(python, "-m", "pacesetter", "--help", name="help") for _ in range(3))
+    cold = run(python, "-c", FIRST_STEP, name="cold")
+    warm = median(run(python, "-c", FIRST_STEP, name="warm") for _ in range(3))
+    print(f"--help: {aid:.2f} s (target 0.5)")
+    print(f"first env step: {warm:.2f} s warm (target 4), {cold:.2f} s cold (target 12)")
+
+
+PARTS = {f.__name__: f for f in (outside, members, checkpoint, startup, memory)}
+
+
+def main() -> None:
+    """Measure the parts that are named."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("parts", nargs="+", choices=PARTS)
+    print(f"jax {jax.__version__}, {len(os.sched_getaffinity(0))} cores", flush=True)
+    for part in parser.parse_args().parts:
+        with TemporaryDirectory() as folder:
+            PARTS[part](folder)
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""The speed gate: what is stable on a noisy machine. Seconds are for benchmarks/."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from pacesetter import algorithms
+from pacesetter.algorithm import Spec
+from pacesetter.config import settle
+from pacesetter.training.population import Population
+from pacesetter.training.replay import Columns
+from pacesetter.training.trainer import Trainer
+
+HALF_CHEETAH = Spec(17, 6)
+WORK = {
+    "td3": 414.6e6,
+    "sac": 581.6e6,
+}  # FLOP an update of its matrix products (benchmarks/ceiling.py)
+CALLS = 95  # Python calls a step of one td3 member; it was 88.5
+
+
+def costs(name: str) -> dict[str, float]:
+    """XLA's own count for one compiled cycle, by update."""
+    config = settle(name, "HalfCheetah-v5")
+    algorithm = algorithms.find(name).build(HALF_CHEETAH, config.hyper)
+    columns = Columns(*HALF_CHEETAH)
+    population = Population(algorithm, columns, 0, normalize=False)
+    state = jax.eval_shape(algorithm.init, jax.random.key(0))
+    rows = jax.ShapeDtypeStruct((algorithm.cycle, 256, columns.width), np.float32)
+    still = np.zeros(17, np.float32), np.ones(17, np.float32)
+    lowered = population._update.lower(state, 0, 0, rows, None, still, population.key)
+    found: Any = lowered.compile().cost_analysis()
+    return {key: found[key] / algorithm.cycle for key in ("flops", "bytes accessed")}
+
+
+@pytest.mark.parametrize(("name", "megabytes"), [("td3", 36), ("sac", 52)])
+def test_an_update_computes_little_but_its_matrix_products(name: str, megabytes: float) -> None:
+    """At most 3% of arithmetic beside them, and no array moved more often than now."""
+    found = costs(name)
+    assert WORK[name] <= found["flops"] <= 1.03 * WORK[name]
+    assert found["bytes accessed"] <= megabytes * 1e6
+
+
+def test_nothing_is_compiled_after_the_first_round(tmp_path: Path) -> None:
+    """Whoever waits, whatever is due: rounds of members that end at different steps included."""
+    compiled: list[str] = []
+    settings: dict[str, Any] = {"warmup": 50, "steps": 1500, "hidden": (8,), "batch_size": 8}
+    trainer = Trainer(
+        "multi-td3", "probe_envs:Scripted-v0", runs=tmp_path, eval_episodes=1, **settings
+    )
+    watching = False
+
+    def listen(event: str, duration: float, **details: Any) -> None:
+        if watching and "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for report in trainer:
+            watching = watching or (report.kind == "select" and report.step > 200)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert trainer.progress.selections > 3
+    assert not compiled
+
+
+def test_python_calls_of_a_step(tmp_path: Path) -> None:
+    """Counted by the interpreter: collecting, one update a step, bookkeeping, nothing else."""
+    trainer = Trainer(
+        "td3", "HalfCheetah-v5", runs=tmp_path, warmup=20, hidden=(8,), batch_size=8, steps=10**4
+    )
+    ensemble, calls = trainer.ensemble, 0
+    for _ in range(30):
+        ensemble.tick()
+
+    def count(frame: Any, event: str, argument: Any) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    sys.setprofile(count)
+    try:
+        for _ in range(100):
+            ensemble.tick()
+    finally:
+        sys.setprofile(None)
+    trainer.close()
+    assert calls / 100 <= CALLS
