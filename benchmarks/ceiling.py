@@ -70,9 +70,11 @@ def alone(product: Product, rng: np.random.Generator) -> Callable[[], Any]:
     return lambda: program(pairs)
 
 
-def whole(name: str, spec: Spec, members: int) -> tuple[Callable[[], Any], Counter[Product], int]:
+def whole(
+    name: str, spec: Spec, members: int, **settings: Any
+) -> tuple[Callable[[], Any], Counter[Product], int]:
     """A cycle of every member as training calls it, its products, and its updates."""
-    config = settle(name, "HalfCheetah-v5")
+    config = settle(name, "HalfCheetah-v5", settings)
     algorithm = algorithms.find(config.run.algorithm).build(spec, config.hyper)
     columns = Columns(*spec, len(algorithm.mask(np.random.default_rng(0))))
     population = Population(algorithm, columns, 0, config.hyper.normalize_observation)

@@ -1,0 +1,171 @@
+"""How the cost of TD3 grows, as a table and a picture: each setting alone, against its floor.
+
+The floor is the FLOP count of an update's matrix products over what this machine makes of a
+256 x 256 x 256 product, measured in the same process, in turn with the updates.
+
+    python benchmarks/growth.py -o docs/growth.png > growth.md
+"""
+
+import argparse
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import jax
+import matplotlib
+import numpy as np
+from ceiling import TOGETHER, alone, flops, timed, whole
+from tabulate import tabulate
+
+from pacesetter import Trainer
+from pacesetter.algorithm import Spec
+from pacesetter.training.replay import Columns, Replay
+
+matplotlib.use("Agg")
+SQUARE = ((256, 256), (256, 256), (((1,), (0,)), ((), ())))
+CHEETAH = Spec(17, 6)
+
+
+class Point(NamedTuple):
+    """One measured size: seconds by update (or draw, or step) and its floor in seconds."""
+
+    what: str
+    size: int
+    seconds: float
+    floor: float | None
+
+
+def peak(rng: np.random.Generator) -> Callable[[], float]:
+    """Measures FLOP/s of square products of 256 each time it is called."""
+    call = alone(SQUARE, rng)
+    call()
+    return lambda: flops(SQUARE) * TOGETHER / timed(call, 20)
+
+
+def updates(what: str, sizes: list[int], task: Callable[[int], Any]) -> Iterator[Point]:
+    """Seconds an update at each size, all sizes in turn."""
+    best = peak(np.random.default_rng(0))
+    cases = {size: task(size) for size in sizes}
+    for call, *_ in cases.values():
+        call()
+    took: dict[int, list[float]] = {size: [] for size in sizes}
+    floors: dict[int, list[float]] = {size: [] for size in sizes}
+    for _ in range(5):
+        for size, (call, counts, cycle) in cases.items():
+            work = sum(flops(p) * n for p, n in counts.items()) / cycle
+            repeats = max(1, int(0.2 * 1e11 / (work * cycle)))
+            took[size].append(timed(call, repeats) / cycle)
+            floors[size].append(work / best())
+    for size in sizes:
+        yield Point(what, size, median(took[size]), median(floors[size]))
+
+
+def members(size: int) -> Any:
+    return whole("td3", CHEETAH, size)
+
+
+def hidden(size: int) -> Any:
+    return whole("td3", CHEETAH, 1, hidden=(size, size))
+
+
+def batch(size: int) -> Any:
+    return whole("td3", CHEETAH, 1, batch_size=size)
+
+
+def observation(size: int) -> Any:
+    return whole("td3", Spec(size, 6), 1)
+
+
+def replay(sizes: list[int]) -> Iterator[Point]:
+    """Seconds to draw a minibatch of 256 from a full ring."""
+    rng = np.random.default_rng(0)
+    for size in sizes:
+        with TemporaryDirectory() as folder:
+            ring = Replay(Path(folder) / "ring", Columns(*CHEETAH), size, size)
+            ring.rows[:] = 1.0
+            ring.head = size
+            took = median(timed(lambda r=ring: r.sample(rng, (256,)), 200) for _ in range(5))
+            ring.close()
+        yield Point("replay rows (a draw)", size, took, None)
+
+
+def updates_per_step(sizes: list[int]) -> Iterator[Point]:
+    """Seconds of a whole training step."""
+    for size in sizes:
+        with TemporaryDirectory() as folder:
+            trainer = Trainer(
+                "td3", "HalfCheetah-v5", runs=folder, warmup=50, eval_every=10**9,
+                eval_episodes=1, updates_per_step=size,
+            )  # fmt: skip
+            for _ in range(100):
+                trainer.ensemble.tick()
+            took = median(timed(trainer.ensemble.tick, 100) for _ in range(3))
+            trainer.close()
+        yield Point("updates a step (a step)", size, took, None)
+
+
+def measured() -> Iterator[Point]:
+    """Every table, small sizes first."""
+    yield from updates("members", [1, 2, 5, 10, 20], members)
+    yield from updates("hidden width", [64, 128, 256, 512, 1024], hidden)
+    yield from updates("batch", [64, 256, 1024, 4096], batch)
+    yield from updates("observation size", [11, 17, 105, 376], observation)
+    yield from replay([10_000, 100_000, 1_000_000])
+    yield from updates_per_step([1, 2, 4, 8])
+
+
+def picture(points: list[Point], path: str) -> None:
+    """One small plot a setting: measured, and the floor where there is one."""
+    from matplotlib import pyplot as plt
+
+    kinds = list(dict.fromkeys(point.what for point in points))
+    figure, grid = plt.subplots(2, 3, figsize=(11, 6), layout="constrained")
+    for axes, kind in zip(grid.flat, kinds, strict=True):
+        own = [point for point in points if point.what == kind]
+        sizes = [point.size for point in own]
+        axes.loglog(sizes, [p.seconds * 1e3 for p in own], "o-", color="#0072B2", label="measured")
+        if own[0].floor is not None:
+            floors = [(p.floor or 0) * 1e3 for p in own]
+            axes.loglog(sizes, floors, "--", color="#D55E00", label="floor from FLOPs")
+        axes.set(xlabel=kind, ylabel="milliseconds", xticks=sizes)
+        axes.set_xticks(sizes, [f"{size:,}" for size in sizes], minor=False)
+        axes.set_xticks([], minor=True)
+        axes.grid(alpha=0.3)
+    grid.flat[0].legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def row(point: Point) -> tuple[str, ...]:
+    """A line of the table."""
+    start = (point.what, f"{point.size:,}", f"{point.seconds * 1e3:.3f}")
+    if point.floor is None:
+        return (*start, "-", "-")
+    return (*start, f"{point.floor * 1e3:.3f}", f"{point.floor / point.seconds:.2f}")
+
+
+def main() -> None:
+    """Print the table, draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("-o", "--output", default="growth.png")
+    chosen = parser.parse_args()
+    points = list(measured())
+    rows = [
+        (p.what, f"{p.size:,}", f"{p.seconds * 1e3:.3f}")
+        + (
+            ("-", "-")
+            if p.floor is None
+            else (f"{p.floor * 1e3:.3f}", f"{p.floor / p.seconds:.2f}")
+        )
+        for p in points
+    ]
+    print(f"jax {jax.__version__}, {len(os.sched_getaffinity(0))} cores\n")
+    heads = ["setting", "size", "ms an update", "floor ms", "floor / measured"]
+    print(tabulate(rows, heads, "github", disable_numparse=True))
+    picture(points, chosen.output)
+
+
+if __name__ == "__main__":
+    main()
