@@ -65,6 +65,7 @@ class OffPolicy(Hyper):
 
     batch_size: int = Field(256, ge=1, description="transitions in a minibatch")
     replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
+    replay: Literal["uniform"] = Field("uniform", description="how minibatches are drawn")
     warmup: Count = Field(25_000, ge=0, description="first steps of all members, uniform actions")
     warmup_updates: bool = Field(False, description="update during the warm-up too")
     updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")

@@ -1,35 +1,99 @@
-"""Action noise, as pairs of functions: what an episode starts with, and one step of it."""
+"""How a deterministic actor explores: noise on its actions, or on its own weights."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from pacesetter.policy import Floats
+from pacesetter import nets
+from pacesetter.policy import Floats, Layers, forward
 
 OU_PULL = 0.15
+ADAPT_EVERY = 50  # updates of a learner between two adaptations of its parameter noise
+ADAPT_FACTOR = 1.01
+SIGMA_RANGE = (1e-4, 1.0)  # where tanh saturates, distance no longer tells of sigma
+NOISY = ("kernel", "bias")  # and not the gains of layer norm
+Array = jax.Array
 Draw = np.random.Generator
 
 
 class Exploration(NamedTuple):
-    """`begin(size) -> memory` at an episode's start; `noise(memory, scale, size, rng)` a step."""
+    """`begin(acting, size, rng) -> memory` at an episode's start; then, a step,
+    `act(acting, memory, observation, scale, rng) -> (action, memory)`.
+    """
 
-    begin: Callable[[int], Any]
-    noise: Callable[[Any, float, int, Draw], tuple[Floats, Any]]
-
-
-def _gaussian(memory: Any, scale: float, size: int, rng: Draw) -> tuple[Floats, Any]:
-    return np.float32(scale) * rng.standard_normal(size, np.float32), memory
+    begin: Callable[[Any, int, Draw], Any]
+    act: Callable[[Any, Any, Floats, float, Draw], tuple[Floats, Any]]
 
 
-def _ou(memory: Floats, scale: float, size: int, rng: Draw) -> tuple[Floats, Any]:
-    kick = np.float32(scale) * rng.standard_normal(size, np.float32)
+def _gaussian(
+    actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
+) -> tuple[Floats, Any]:
+    action = np.tanh(forward(actor, observation))
+    noise: Floats = np.float32(scale) * rng.standard_normal(len(action), np.float32)
+    return action + noise, memory
+
+
+def _ou(
+    actor: Layers, memory: Floats, observation: Floats, scale: float, rng: Draw
+) -> tuple[Floats, Any]:
+    kick = np.float32(scale) * rng.standard_normal(len(memory), np.float32)
     moved = np.add((1 - OU_PULL) * memory, kick, dtype=np.float32)
-    return moved, moved
+    return np.tanh(forward(actor, observation)) + moved, moved
+
+
+def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:
+    actor, sigma = acting
+
+    def noisy(value: Floats) -> Floats:
+        return value + np.float32(sigma) * rng.standard_normal(value.shape, np.float32)
+
+    return tuple(
+        {name: noisy(value) if name in NOISY else value for name, value in layer.items()}
+        for layer in actor
+    )
+
+
+def _by_noisy_actor(
+    acting: Any, memory: Layers, observation: Floats, scale: float, rng: Draw
+) -> tuple[Floats, Any]:
+    return np.tanh(forward(memory, observation)), memory
 
 
 KINDS = {
-    "gaussian": Exploration(lambda size: (), _gaussian),
+    "gaussian": Exploration(lambda acting, size, rng: (), _gaussian),
     # Ornstein-Uhlenbeck with theta 0.15 and unit time step (Lillicrap et al. 2016, section 7).
-    "ou": Exploration(lambda size: np.zeros(size, np.float32), _ou),
+    "ou": Exploration(lambda acting, size, rng: np.zeros(size, np.float32), _ou),
+    # Plappert et al. 2018: one actor with noisy weights acts a whole episode, without other noise.
+    "parameter": Exploration(_noisy_actor, _by_noisy_actor),
 }
+
+
+def first_sigma(goal: float) -> Array:
+    """Deviation of the weights' noise at the start: the goal itself."""
+    return jnp.clip(jnp.asarray(goal, jnp.float32), *SIGMA_RANGE)
+
+
+def adapt(sigma: Array, actor: nets.Network, goal: float, observation: Array, key: Array) -> Array:
+    """Sigma moved 1% towards where noisy actions are `goal` from clean ones (Plappert et al. 2018,
+    appendix C), on a batch of observations (B, O) and with a noisy copy drawn for this alone.
+    """
+    apart = nets.actor(perturb(actor, sigma, key), observation) - nets.actor(actor, observation)
+    distance = jnp.sqrt((apart**2).mean())
+    moved = jnp.where(distance > goal, sigma / ADAPT_FACTOR, sigma * ADAPT_FACTOR)
+    return jnp.clip(moved, *SIGMA_RANGE)
+
+
+def perturb(actor: nets.Network, sigma: Array, key: Array) -> nets.Network:
+    """The actor with Gaussian noise on every weight and bias."""
+    keys = jax.random.split(key, (len(actor), len(NOISY)))
+    return tuple(
+        layer
+        | {
+            name: layer[name] + sigma * jax.random.normal(k, layer[name].shape)
+            for name, k in zip(NOISY, layer_keys, strict=True)
+        }
+        for layer, layer_keys in zip(actor, keys, strict=True)
+    )

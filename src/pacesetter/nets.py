@@ -68,22 +68,31 @@ def actor(network: Network, observation: Array) -> Array:
     return jnp.tanh(apply(network, observation))
 
 
-def critic(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
-    """Value (...) of an action, which joins the observation's features at `action_layer`."""
+def outputs(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
+    """What a critic says (..., outputs) of an action, which joins at `action_layer`."""
     x = observation
     for layer in network[:action_layer]:
         x = hidden_layer(layer, x, jax.nn.relu)
-    return apply(network[action_layer:], jnp.concatenate([x, action], axis=-1))[..., 0]
+    return apply(network[action_layer:], jnp.concatenate([x, action], axis=-1))
+
+
+def critic(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
+    """Value (...) of an action by a critic with one output."""
+    return outputs(network, observation, action, action_layer)[..., 0]
 
 
 def critics(networks: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
-    """Values (N, B) of N critics, whose leaves carry a leading axis of N, for one batch."""
+    """Values (N, B) of N critics with one output each, for one batch."""
+    return each(partial(critic, action_layer=action_layer), networks, observation, action)
+
+
+def each(one: Callable[..., Any], networks: Network, *inputs: Array) -> Any:
+    """`one(network, *inputs)` of N networks, whose leaves carry a leading axis of N."""
     count = networks[0]["kernel"].shape[0]
-    # Each critic gets inputs of its own: from shared ones XLA makes one wide product whose result
+    # Each network gets inputs of its own: from shared ones XLA makes one wide product whose result
     # it then has to transpose, which costs 5% of an update.
-    inputs = jax.tree.map(lambda x: jnp.stack([x] * count), (observation, action))
-    one = partial(critic, action_layer=action_layer)
-    return jax.vmap(one)(networks, *jax.lax.optimization_barrier(inputs))
+    own = jax.tree.map(lambda x: jnp.stack([x] * count), inputs)
+    return jax.vmap(one)(networks, *jax.lax.optimization_barrier(own))
 
 
 def descend(

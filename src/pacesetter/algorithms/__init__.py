@@ -18,6 +18,9 @@ class Entry(NamedTuple):
 TABLE = {
     "td3": Entry("pacesetter.algorithms.td3", "twin delayed DDPG (Fujimoto et al. 2018)"),
     "sac": Entry("pacesetter.algorithms.sac", "soft actor-critic, temperature learned"),
+    "crossq": Entry(
+        "pacesetter.algorithms.crossq", "SAC with batch renorm and no targets (Bhatt et al. 2024)"
+    ),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
 }
 

@@ -10,21 +10,31 @@ entropy refers to that box.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import nets
+from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.config import STRICT, Count, OffPolicy, Width
 from pacesetter.policy import Actors, Floats, Layers, clip, forward
 
 LOG_STD_RANGE = (-20.0, 2.0)
+
+
+def _policy(kind: str) -> str:
+    if kind != "policy":
+        raise ValueError("is fixed: a stochastic policy explores by itself; allowed: policy")
+    return kind
+
+
+Exploration = Annotated[str, AfterValidator(_policy)]
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -44,6 +54,12 @@ class Hyper(OffPolicy):
     critics: int = Field(2, ge=1, description="critics whose minimum is the target")
     critic_layer_norm: bool = Field(False, description="layer norm before each critic ReLU")
     actor_layer_norm: bool = Field(False, description="layer norm before each actor ReLU")
+    quantiles: heads.Quantiles = Field(
+        0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
+    )
+    exploration: Exploration = Field(
+        "policy", description="fixed: the stochastic policy explores by itself"
+    )
 
 
 class State(NamedTuple):
@@ -66,6 +82,11 @@ class SAC:
     spec: Spec
     hyper: Hyper
     cycle: int = 1
+
+    @cached_property
+    def head(self) -> heads.Head:
+        """What the critics' outputs mean."""
+        return heads.choose(self.hyper.quantiles, self.hyper.replay)
 
     def mask(self, rng: np.random.Generator) -> Floats:
         return NO_MASK
@@ -99,9 +120,7 @@ class SAC:
     def act(
         self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        mean, log_std = np.split(forward(acting, observation), 2)
-        noise = rng.standard_normal(len(mean), np.float32)
-        return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise), memory
+        return explore(acting, observation, rng), memory
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         target_key, actor_key = jax.random.split(key)
@@ -115,21 +134,20 @@ class SAC:
         return {}
 
     def policy(self, state: State) -> Actors:
-        """The deterministic action is the tanh of the mean."""
-        size = self.spec.action_size
-        *hidden, last = state.actor
-        mean = {name: value[..., :size] for name, value in last.items()}
-        one = jax.tree.map(lambda x: x[None], (*hidden, mean))
-        return Actors(one, activation="relu", output="tanh")
+        return mean_policy(state.actor, self.spec.action_size)
 
     # The pieces that `update` composes.
 
     def target(self, state: State, batch: Batch, key: Array) -> Array:
-        """Soft target y (B,)."""
+        """Soft target y (B,), of quantiles (B, M)."""
         action, log_prob = sample(state.actor, batch.next_observation, key)
-        values = nets.critics(state.target_critic, batch.next_observation, action).min(axis=0)
-        soft = values - jnp.exp(state.log_alpha) * log_prob
-        return jax.lax.stop_gradient(batch.reward + batch.discount * soft)
+        said = nets.each(nets.outputs, state.target_critic, batch.next_observation, action)
+        soft = self.head.least(said).T - jnp.exp(state.log_alpha) * log_prob
+        return jax.lax.stop_gradient(batch.reward + batch.discount * soft).T
+
+    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+        """Every critic's value (critics, B)."""
+        return self.head.value(nets.each(nets.outputs, critic, observation, action))
 
     def fit_critic(
         self, state: State, batch: Batch, y: Array, weight: Array
@@ -137,8 +155,9 @@ class SAC:
         """One Adam step of all critics, one soft step of their targets; loss and |error| (B,)."""
 
         def loss(critic: nets.Network) -> tuple[Array, Array]:
-            error = nets.critics(critic, batch.observation, batch.action) - y
-            return (weight * error**2).mean(axis=1).sum(), jnp.abs(error).max(axis=0)
+            said = nets.each(nets.outputs, critic, batch.observation, batch.action)
+            losses, error = self.head.loss(said, y)
+            return (weight * losses).mean(axis=1).sum(), error.max(axis=0)
 
         (value, error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         adam = optax.adam(self.hyper.critic_learning_rate)
@@ -157,38 +176,63 @@ class SAC:
 
         def loss(actor: nets.Network) -> tuple[Array, Array]:
             action, log_prob = sample(actor, batch.observation, key)
-            values = nets.critics(state.critic, batch.observation, action).min(axis=0)
+            values = self.values(state.critic, batch.observation, action).min(axis=0)
             return (alpha * log_prob - values).mean(), log_prob.mean()
 
         (value, log_prob), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = optax.adam(self.hyper.actor_learning_rate)
         actor, optimizer = nets.descend(adam, state.actor, gradient, state.actor_optimizer)
-        wanted = self.hyper.target_entropy
-        excess = -log_prob - (-self.spec.action_size if wanted is None else wanted)
-        # d/dlog_alpha of log_alpha * excess entropy: too little entropy raises the temperature.
-        adam = optax.adam(self.hyper.alpha_learning_rate)
-        log_alpha, alpha_optimizer = nets.descend(
-            adam, state.log_alpha, excess, state.alpha_optimizer
-        )
-        state = state._replace(
-            actor=actor,
-            actor_optimizer=optimizer,
-            log_alpha=log_alpha,
-            alpha_optimizer=alpha_optimizer,
-        )
-        return state, {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
+        state = state._replace(actor=actor, actor_optimizer=optimizer)
+        losses = {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
+        return fit_temperature(self, state, log_prob), losses
 
     def _new_critic(self, key: Array) -> nets.Network:
         inputs = self.spec.observation_size + self.spec.action_size
-        return nets.init(key, inputs, self.hyper.hidden, 1, layer_norm=self.hyper.critic_layer_norm)
+        return nets.init(
+            key,
+            inputs,
+            self.hyper.hidden,
+            self.head.outputs,
+            layer_norm=self.hyper.critic_layer_norm,
+        )
 
 
 build = SAC
 
 
+def explore(actor: Layers, observation: Floats, rng: np.random.Generator) -> Floats:
+    """An action (A,) drawn in NumPy."""
+    mean, log_std = np.split(forward(actor, observation), 2)
+    noise = rng.standard_normal(len(mean), np.float32)
+    return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise)
+
+
+def mean_policy(actor: nets.Network, size: int) -> Actors:
+    """The deterministic action (size,) is the tanh of the mean."""
+    *hidden, last = actor
+    mean = {name: value[..., :size] for name, value in last.items()}
+    one = jax.tree.map(lambda x: x[None], (*hidden, mean))
+    return Actors(one, activation="relu", output="tanh")
+
+
+def fit_temperature(learner: Any, state: Any, log_prob: Array) -> Any:
+    """One Adam step of the temperature; too little entropy raises it."""
+    hyper = learner.hyper
+    wanted = -learner.spec.action_size if hyper.target_entropy is None else hyper.target_entropy
+    excess = -log_prob - wanted  # d/dlog_alpha of log_alpha * excess entropy
+    adam = optax.adam(hyper.alpha_learning_rate)
+    log_alpha, optimizer = nets.descend(adam, state.log_alpha, excess, state.alpha_optimizer)
+    return state._replace(log_alpha=log_alpha, alpha_optimizer=optimizer)
+
+
 def sample(actor: nets.Network, observation: Array, key: Array) -> tuple[Array, Array]:
     """An action (..., A) of the squashed Gaussian and its log-probability (...) in [-1, 1]."""
-    mean, log_std = jnp.split(nets.apply(actor, observation), 2, axis=-1)
+    return sample_from(nets.apply(actor, observation), key)
+
+
+def sample_from(said: Array, key: Array) -> tuple[Array, Array]:
+    """The same from what an actor said (..., 2 A)."""
+    mean, log_std = jnp.split(said, 2, axis=-1)
     log_std = jnp.clip(log_std, *LOG_STD_RANGE)
     noise = jax.random.normal(key, mean.shape)
     before = mean + jnp.exp(log_std) * noise

@@ -9,23 +9,28 @@ move all targets a little towards their networks
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal, NamedTuple
+from functools import cached_property, partial
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from pydantic import Field
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import nets
+from pacesetter import exploration, heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.config import STRICT, OffPolicy, Width
-from pacesetter.exploration import KINDS
-from pacesetter.policy import Actors, Floats, Layers, forward
+from pacesetter.policy import Actors, Floats
 
 UNROLLED = 4  # critic steps a loop; without one, XLA need not copy states between iterations
+
+
+def _needs_layer_norm(kind: str, info: ValidationInfo) -> str:
+    if kind == "parameter" and not info.data.get("actor_layer_norm"):
+        raise ValueError("is on weights that one deviation must fit; add --actor-layer-norm")
+    return kind
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -42,10 +47,17 @@ class Hyper(OffPolicy):
     policy_delay: int = Field(2, ge=1, description="critic updates an actor update")
     target_noise: float = Field(0.2, ge=0, description="deviation of the target action's noise")
     target_noise_clip: float = Field(0.5, ge=0, description="bound of the target action's noise")
-    exploration: Literal["gaussian", "ou"] = Field("gaussian", description="noise on actions")
-    exploration_noise: float = Field(0.1, ge=0, description="deviation of that noise")
     critic_layer_norm: bool = Field(False, description="layer norm before each critic ReLU")
     actor_layer_norm: bool = Field(False, description="layer norm before each actor ReLU")
+    quantiles: heads.Quantiles = Field(
+        0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
+    )
+    exploration: Annotated[
+        Literal["gaussian", "ou", "parameter"], AfterValidator(_needs_layer_norm)
+    ] = Field("gaussian", description="noise on actions, or on the actor's weights")
+    exploration_noise: float = Field(
+        0.1, ge=0, description="deviation of that noise, for parameter of the actions it causes"
+    )
 
 
 class State(NamedTuple):
@@ -58,6 +70,7 @@ class State(NamedTuple):
     actor_optimizer: Any
     critic_optimizer: Any
     updates: Array
+    sigma: Array | None = None  # deviation of parameter noise
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,11 @@ class TD3:
     critic_decay: float = 0.0
     output_bound: float | None = None
 
+    @cached_property
+    def head(self) -> heads.Head:
+        """What the critics' outputs mean."""
+        return heads.choose(self.hyper.quantiles, self.hyper.replay)
+
     @property
     def cycle(self) -> int:
         return self.hyper.policy_delay
@@ -81,6 +99,7 @@ class TD3:
         actor_key, critic_key = jax.random.split(key)
         actor = self._new_actor(actor_key)
         critic = jax.vmap(self._new_critic)(jax.random.split(critic_key, self.hyper.critics))
+        noisy = self.hyper.exploration == "parameter"
         return State(
             actor=actor,
             critic=critic,
@@ -89,20 +108,21 @@ class TD3:
             actor_optimizer=self._actor_adam.init(actor),
             critic_optimizer=self._critic_adam.init(critic),
             updates=jnp.zeros((), jnp.int32),
+            sigma=exploration.first_sigma(self.hyper.exploration_noise) if noisy else None,
         )
 
-    def acting(self, state: State) -> nets.Network:
-        return state.actor
+    def acting(self, state: State) -> Any:
+        return state.actor if state.sigma is None else (state.actor, state.sigma)
 
-    def begin(self, acting: Layers, rng: np.random.Generator) -> Any:
-        return KINDS[self.hyper.exploration].begin(self.spec.action_size)
+    def begin(self, acting: Any, rng: np.random.Generator) -> Any:
+        kind = exploration.KINDS[self.hyper.exploration]
+        return kind.begin(acting, self.spec.action_size, rng)
 
     def act(
-        self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
+        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        explore = KINDS[self.hyper.exploration].noise
-        noise, memory = explore(memory, self.hyper.exploration_noise, self.spec.action_size, rng)
-        return np.tanh(forward(acting, observation)) + noise, memory
+        kind = exploration.KINDS[self.hyper.exploration]
+        return kind.act(acting, memory, observation, self.hyper.exploration_noise, rng)
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         def critic_step(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:
@@ -111,12 +131,17 @@ class TD3:
             state, loss, error = self.fit_critic(state, minibatch, y, minibatch.weight)
             return state, (loss, error)
 
-        steps = (batch, jax.random.split(key, self.cycle))
-        state, (losses, error) = jax.lax.scan(
-            critic_step, state, steps, unroll=min(self.cycle, UNROLLED)
+        keys = jax.random.split(key, self.cycle + 1)
+        state, (critic_losses, error) = jax.lax.scan(
+            critic_step, state, (batch, keys[:-1]), unroll=min(self.cycle, UNROLLED)
         )
-        state, actor_loss = self.fit_actor(state, jax.tree.map(lambda x: x[-1], batch))
-        return Update(state, {"critic_loss": losses.mean(), "actor_loss": actor_loss}, error)
+        last = jax.tree.map(lambda x: x[-1], batch)
+        state, actor_loss = self.fit_actor(state, last)
+        losses = {"critic_loss": critic_losses.mean(), "actor_loss": actor_loss}
+        if state.sigma is not None:
+            state = self.adapt(state, last, keys[-1])
+            losses["sigma"] = state.sigma
+        return Update(state, losses, error)
 
     def ledger(self, updates: int, actions: int) -> dict[str, int]:
         return {}
@@ -128,17 +153,23 @@ class TD3:
     # The pieces that `update` composes.
 
     def target(self, state: State, batch: Batch, key: Array) -> Array:
-        """Clipped double-Q target y (B,); one noise draw a sample, shared by the critics."""
+        """Clipped double-Q target y (B,), of quantiles (B, M); one noise draw a sample."""
         limit = self.hyper.target_noise_clip
         noise = self.hyper.target_noise * jax.random.normal(key, batch.action.shape)
         clean = nets.actor(state.target_actor, batch.next_observation)
         action = jnp.clip(clean + jnp.clip(noise, -limit, limit), -1, 1)
-        values = self.values(state.target_critic, batch.next_observation, action)
-        return jax.lax.stop_gradient(batch.reward + batch.discount * values.min(axis=0))
+        said = self.outputs(state.target_critic, batch.next_observation, action)
+        following = self.head.least(said).T  # rows last, for quantiles too
+        return jax.lax.stop_gradient(batch.reward + batch.discount * following).T
+
+    def outputs(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+        """All that every critic says (critics, B, M)."""
+        one = partial(nets.outputs, action_layer=self.action_layer)
+        return nets.each(one, critic, observation, action)
 
     def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
-        return nets.critics(critic, observation, action, self.action_layer)
+        return self.head.value(self.outputs(critic, observation, action))
 
     def fit_critic(
         self, state: State, batch: Batch, y: Array, weight: Array
@@ -146,8 +177,8 @@ class TD3:
         """One Adam step of all critics towards y; the loss and each row's largest |error| (B,)."""
 
         def loss(critic: nets.Network) -> tuple[Array, Array]:
-            error = self.values(critic, batch.observation, batch.action) - y
-            return (weight * error**2).mean(axis=1).sum(), jnp.abs(error).max(axis=0)
+            losses, error = self.head.loss(self.outputs(critic, batch.observation, batch.action), y)
+            return (weight * losses).mean(axis=1).sum(), error.max(axis=0)
 
         (value, error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         critic, optimizer = nets.descend(
@@ -162,7 +193,8 @@ class TD3:
 
         def loss(actor: nets.Network) -> Array:
             action = nets.actor(actor, batch.observation)
-            return -nets.critic(first, batch.observation, action, self.action_layer).mean()
+            said = nets.outputs(first, batch.observation, action, self.action_layer)
+            return -self.head.value(said).mean()
 
         value, gradient = jax.value_and_grad(loss)(state.actor)
         actor, optimizer = nets.descend(
@@ -177,6 +209,17 @@ class TD3:
         )
         return state, value
 
+    def adapt(self, state: State, batch: Batch, key: Array) -> State:
+        """Parameter noise adapted, if this cycle has passed a multiple of 50 updates."""
+        goal = self.hyper.exploration_noise
+        sigma = jax.lax.cond(
+            state.updates % exploration.ADAPT_EVERY < self.cycle,
+            lambda sigma: exploration.adapt(sigma, state.actor, goal, batch.observation, key),
+            lambda sigma: sigma,
+            state.sigma,
+        )
+        return state._replace(sigma=sigma)
+
     def _new_actor(self, key: Array) -> nets.Network:
         sizes = (self.spec.observation_size, self.hyper.hidden, self.spec.action_size)
         norm = self.hyper.actor_layer_norm
@@ -187,7 +230,7 @@ class TD3:
             key,
             self.spec.observation_size,
             self.hyper.hidden,
-            1,
+            self.head.outputs,
             layer_norm=self.hyper.critic_layer_norm,
             output_bound=self.output_bound,
             joins=(self.action_layer, self.spec.action_size),

@@ -1,0 +1,208 @@
+"""CrossQ (Bhatt et al. 2024), one member. Reference: adityab/CrossQ, sbx/sac at 2811ad1.
+
+SAC without target networks, whose networks batch-renormalise the input of every layer:
+
+for each of `policy_delay` minibatches:
+    one pass of every critic over (s, a) and (s', a') together, a' ~ pi(s')
+    y = r + discount * (min_i critic_i(s', a') - alpha * log pi(a'|s')), without gradient
+    move every critic towards y at (s, a)
+move the actor up min_i critic_i(s, a) - alpha * log pi(a|s) on the last minibatch
+move alpha towards the target entropy
+
+Networks that learn normalise by their batch and move their running statistics; elsewhere they are
+plain networks, into whose weights the running statistics are folded.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from pydantic import Field
+from pydantic.dataclasses import dataclass as settings
+
+from pacesetter import heads, nets, renorm
+from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms import sac
+from pacesetter.algorithms.td3 import UNROLLED
+from pacesetter.config import STRICT, Count, OffPolicy, Width
+from pacesetter.policy import Actors, Floats, Layers
+
+
+@settings(frozen=True, kw_only=True, config=STRICT)
+class Hyper(OffPolicy):
+    """Defaults are the paper's; `crossq-small` has critics as narrow as the actor."""
+
+    warmup: Count = Field(5_000, ge=0, description="first steps of all members, uniform actions")
+    hidden: tuple[Width, ...] = Field(
+        (256, 256), min_length=1, description="widths of the actor's hidden layers"
+    )
+    critic_hidden: tuple[Width, ...] = Field(
+        (2048, 2048), min_length=1, description="widths of the critics' hidden layers"
+    )
+    actor_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the actor")
+    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critics")
+    alpha_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the log temperature")
+    adam_momentum: float = Field(
+        0.5, ge=0, lt=1, description="Adam's first decay for actor and critics"
+    )
+    initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
+    target_entropy: float | None = Field(None, description="nats; none is minus the action size")
+    critics: int = Field(2, ge=1, description="critics whose minimum is the target")
+    policy_delay: int = Field(3, ge=1, description="critic updates an actor update")
+    renorm_after: Count = Field(
+        100_000, ge=0, description="a network's updates with plain batch norm before renorm"
+    )
+    exploration: sac.Exploration = Field(
+        "policy", description="fixed: the stochastic policy explores by itself"
+    )
+
+
+class State(NamedTuple):
+    """One learner; critics carry a leading axis of `critics`. Networks hold their statistics."""
+
+    actor: nets.Network
+    critic: nets.Network
+    log_alpha: Array
+    actor_optimizer: Any
+    critic_optimizer: Any
+    alpha_optimizer: Any
+    updates: Array
+
+
+@dataclass(frozen=True)
+class CrossQ:
+    """The learner of one member."""
+
+    spec: Spec
+    hyper: Hyper
+
+    @property
+    def cycle(self) -> int:
+        return self.hyper.policy_delay
+
+    @cached_property
+    def head(self) -> heads.Head:
+        """What the critics' outputs mean."""
+        return heads.choose(0, self.hyper.replay)
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        return NO_MASK
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        return {}
+
+    def init(self, key: Array) -> State:
+        actor_key, critic_key = jax.random.split(key)
+        (observation, action), hyper = self.spec, self.hyper
+        actor = renorm.init(actor_key, observation, hyper.hidden, 2 * action)
+        new_critic = partial(
+            renorm.init, inputs=observation + action, hidden=hyper.critic_hidden, outputs=1
+        )
+        critic = jax.vmap(new_critic)(jax.random.split(critic_key, hyper.critics))
+        log_alpha = jnp.log(jnp.asarray(hyper.initial_alpha, jnp.float32))
+        return State(
+            actor=actor,
+            critic=critic,
+            log_alpha=log_alpha,
+            actor_optimizer=self._adam(hyper.actor_learning_rate).init(actor),
+            critic_optimizer=self._adam(hyper.critic_learning_rate).init(critic),
+            alpha_optimizer=optax.adam(hyper.alpha_learning_rate).init(log_alpha),
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def acting(self, state: State) -> nets.Network:
+        return renorm.fold(state.actor)
+
+    def begin(self, acting: Layers, rng: np.random.Generator) -> tuple[()]:
+        return ()
+
+    def act(
+        self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        return sac.explore(acting, observation, rng), memory
+
+    def update(self, state: State, batch: Batch, key: Array) -> Update:
+        def critic_step(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:
+            minibatch, step_key = inputs
+            state, loss, error = self.fit_critic(state, minibatch, minibatch.weight, step_key)
+            return state, (loss, error)
+
+        keys = jax.random.split(key, self.cycle + 1)
+        state, (critic_loss, error) = jax.lax.scan(
+            critic_step, state, (batch, keys[:-1]), unroll=min(self.cycle, UNROLLED)
+        )
+        state, losses = self.fit_actor(state, jax.tree.map(lambda x: x[-1], batch), keys[-1])
+        return Update(state, {"critic_loss": critic_loss.mean(), **losses}, error)
+
+    def policy(self, state: State) -> Actors:
+        return sac.mean_policy(renorm.fold(state.actor), self.spec.action_size)
+
+    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+        """Every critic's value (critics, B), by its running statistics."""
+        return nets.critics(jax.vmap(renorm.fold)(critic), observation, action)
+
+    # The pieces that `update` composes.
+
+    def fit_critic(
+        self, state: State, batch: Batch, weight: Array, key: Array
+    ) -> tuple[State, Array, Array]:
+        """One Adam step of all critics, with the target from the same pass; loss, |error| (B,)."""
+        following, log_prob = sac.sample(renorm.fold(state.actor), batch.next_observation, key)
+        inputs = jnp.concatenate(
+            [
+                jnp.concatenate([batch.observation, batch.action], axis=-1),
+                jnp.concatenate([batch.next_observation, following], axis=-1),
+            ]
+        )
+        forward = partial(renorm.train, warm=state.updates >= self.hyper.renorm_after)
+
+        def loss(critic: nets.Network) -> tuple[Array, Any]:
+            said, trained = nets.each(forward, critic, inputs)
+            now, later = jnp.split(said, 2, axis=1)
+            soft = self.head.least(later) - jnp.exp(state.log_alpha) * log_prob
+            y = jax.lax.stop_gradient(batch.reward + batch.discount * soft)
+            losses, error = self.head.loss(now, y)
+            return (weight * losses).mean(axis=1).sum(), (error.max(axis=0), trained)
+
+        (value, (error, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
+        adam = self._adam(self.hyper.critic_learning_rate)
+        critic, optimizer = nets.descend(adam, state.critic, gradient, state.critic_optimizer)
+        state = state._replace(
+            critic=renorm.with_statistics(critic, trained),
+            critic_optimizer=optimizer,
+            updates=state.updates + 1,
+        )
+        return state, value, error
+
+    def fit_actor(self, state: State, batch: Batch, key: Array) -> tuple[State, dict[str, Array]]:
+        """One Adam step of the actor on the critics as they evaluate, one of the temperature."""
+        alpha = jnp.exp(state.log_alpha)
+        warm = state.updates // self.cycle > self.hyper.renorm_after
+
+        def loss(actor: nets.Network) -> tuple[Array, Any]:
+            said, trained = renorm.train(actor, batch.observation, warm)
+            action, log_prob = sac.sample_from(said, key)
+            values = self.values(state.critic, batch.observation, action).min(axis=0)
+            return (alpha * log_prob - values).mean(), (log_prob.mean(), trained)
+
+        (value, (log_prob, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
+        adam = self._adam(self.hyper.actor_learning_rate)
+        actor, optimizer = nets.descend(adam, state.actor, gradient, state.actor_optimizer)
+        state = state._replace(
+            actor=renorm.with_statistics(actor, trained), actor_optimizer=optimizer
+        )
+        return sac.fit_temperature(self, state, log_prob), {
+            "actor_loss": value,
+            "alpha": alpha,
+            "entropy": -log_prob,
+        }
+
+    def _adam(self, rate: float) -> optax.GradientTransformation:
+        return optax.adam(rate, b1=self.hyper.adam_momentum)
+
+
+build = CrossQ
