@@ -105,6 +105,23 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["train", "ddpg", TASK, "--target-noise", "0.1"],
         ["target_noise", "0.1", "allowed: 0"],
     ),
+    "parameter noise without layer norm": (
+        ["train", "td3", TASK, "--exploration", "parameter"],
+        ["exploration", "parameter", "--actor-layer-norm"],
+    ),
+    "noise on a stochastic policy": (
+        ["train", "sac", TASK, "--exploration", "ou"],
+        ["exploration", "ou", "stochastic", "allowed: policy"],
+    ),
+    "unknown exploration of sac": (
+        ["train", "crossq", TASK, "--exploration", "pink"],
+        ["exploration", "pink", "allowed: policy"],
+    ),
+    "quantiles below none": (
+        ["train", "sac", TASK, "--quantiles", "-1"],
+        ["quantiles", "greater than or equal to 0", "-1"],
+    ),
+    "targets of crossq": (["train", "crossq", TASK, "--tau", "0.01"], ["flag", "--tau"]),
     "resume nothing": (["resume"], ["RUN"]),
     "resume of a missing run": (["resume", "Ant-v5/td3/0"], ["Ant-v5/td3/0", "not found"]),
     "resume elsewhere": (["resume", "x", "--runs", "there"], ["'x'", "not found", "there"]),

@@ -119,6 +119,8 @@ DEFAULTS = {
     ("multi-td3-paper", "Ant-v5"): {"members": "2", "warmup": "10000"},
     ("ddpg", "Ant-v5"): {"critics": "1", "action-layer": "0"},
     ("ddpg-original", "HalfCheetah-v5"): {"warmup": "10000", "exploration": "ou"},
+    ("crossq", "Ant-v5"): {"critic-hidden": "2048 2048", "exploration": "policy"},
+    ("crossq-small", "Ant-v5"): {"critic-hidden": "256 256", "hidden": "256 256"},
     ("demo", "HalfCheetah-v5"): {"members": "2", "critic-layer-norm": "on"},
 }
 
@@ -279,7 +281,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--actor-learning-rate 1e-3 "
         "--critic-learning-rate 2e-3 --tau 0.01 --critics 3 --policy-delay 3 --target-noise 0.1 "
         "--target-noise-clip 0.2 --exploration ou --exploration-noise 0.3 --critic-layer-norm "
-        "--actor-layer-norm --gamma 0.9 --normalize-observation",
+        "--actor-layer-norm --gamma 0.9 --normalize-observation --quantiles 3 --replay uniform",
         {"steps": 300, "time": 600, "checkpoint_every": 3600, "replay_size": 1000},
     ),
     "multi-td3": (

@@ -23,11 +23,43 @@ LEARNS: dict[str, Any] = {
     "exploration_noise": 0.5,
     "eval_every": 10_000,
 }
-both = pytest.mark.parametrize("algorithm", ["td3", "ddpg"])
+NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can settle
+    "initial_alpha": 0.01,
+    "alpha_learning_rate": 1e-6,
+    "exploration_noise": None,
+}
+CROSSQ = NO_ENTROPY | {"critic_hidden": (64, 64), "tau": None, "steps": 2_000}
+NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
+NOISY = {"exploration": "parameter", "actor_layer_norm": True}
+KINDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "td3": ("td3", {}),
+    "ddpg": ("ddpg", {}),
+    "sac": ("sac", NO_ENTROPY),
+    "crossq": ("crossq", CROSSQ | {"renorm_after": 100}),
+    "crossq-batch-norm": ("crossq", CROSSQ | {"batch_size": 256}),
+    "layer-norm": ("td3", NORM),
+    "quantiles": ("td3", {"quantiles": 25}),
+    "sac-quantiles": ("sac", NO_ENTROPY | {"quantiles": 25}),
+    "parameter": ("td3", NOISY),
+    "ddpg-parameter": ("ddpg", NOISY),
+}
 
 
-def learn(algorithm: str, env: str, runs: Path, **kwargs: Any) -> Trainer:
-    trainer = Trainer(algorithm, f"probe_envs:{env}", runs=runs, env_kwargs=kwargs, **LEARNS)
+def kinds(*quick: str) -> Any:
+    """All kinds of learner; those that are not quick here are slow tests."""
+    slow = pytest.mark.slow
+    params = [pytest.param(kind, marks=() if kind in quick else slow) for kind in KINDS]
+    return pytest.mark.parametrize("algorithm", params)
+
+
+both = kinds("td3", "ddpg")
+every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter")
+
+
+def learn(kind: str, env: str, runs: Path, **kwargs: Any) -> Trainer:
+    algorithm, more = KINDS[kind]
+    settings = {name: value for name, value in (LEARNS | more).items() if value is not None}
+    trainer = Trainer(algorithm, f"probe_envs:{env}", runs=runs, env_kwargs=kwargs, **settings)
     run_to_end(trainer)
     return trainer
 
@@ -75,7 +107,7 @@ def test_reward_of_the_action(algorithm: str, runs: Path) -> None:
     near(values(trainer, 0, [0.0]), -1)
 
 
-@both
+@every
 def test_reward_of_the_action_that_fits_what_is_seen(algorithm: str, runs: Path) -> None:
     """Reward -4 (a - s/2)^2 for s = -1 or 1."""
     trainer = learn(algorithm, "BothReward-v0", runs)
@@ -101,7 +133,7 @@ def test_time_limit_is_no_end_of_the_task(algorithm: str, runs: Path) -> None:
     near(values(trainer, 0), 2)
 
 
-@both
+@every
 def test_a_fall_is_the_end_of_the_task(algorithm: str, runs: Path) -> None:
     """Reward 1 for 3 steps is worth 1 + .5 + .25, then less."""
     trainer = learn(algorithm, "Corridor-v0", runs, falls_at=3)

@@ -25,6 +25,20 @@ CASES = {
     "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
     "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
     "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
+    "parameter": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "exploration": "parameter",
+        "actor_layer_norm": True,
+        "copy": "actor",
+    },
+    "quantiles": {"env": "Hopper-v5", "algorithm": "multi-sac", "quantiles": 5},
+    "crossq": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-crossq",
+        "critic_hidden": (16, 16),
+        "renorm_after": 100,
+    },
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
 }
 
@@ -48,7 +62,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
-SLOW = ("normalized", "sac", "ou", "own-replays")
+SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
 
 
 @pytest.mark.parametrize(

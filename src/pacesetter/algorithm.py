@@ -52,8 +52,9 @@ class Algorithm(Protocol):
     """One member's learner: pure functions, no env, no files. The trainer alone lifts it to K.
 
     A state is a NamedTuple. At its top, fields named `*_optimizer` and `updates` are its optimiser,
-    and `actor` with `target_actor` its policy, which is all that a partial copy needs to know. It
-    never holds a random key: clones that shared one would stay equal for ever.
+    and `actor` with `target_actor` and the noise `sigma` its policy, which is all that a partial
+    copy needs to know. It never holds a random key: clones that shared one would stay equal for
+    ever.
     """
 
     @property

@@ -31,8 +31,8 @@ class Exploration(NamedTuple):
 def _gaussian(
     actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
 ) -> tuple[Floats, Any]:
-    action = np.tanh(forward(actor, observation))
-    noise: Floats = np.float32(scale) * rng.standard_normal(len(action), np.float32)
+    action: Floats = np.tanh(forward(actor, observation))
+    noise = np.float32(scale) * rng.standard_normal(action.shape, np.float32)
     return action + noise, memory
 
 

@@ -4,7 +4,6 @@ A learner chooses its head once, when it is made, and asks it wherever outputs b
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Annotated, NamedTuple
 
 import jax
@@ -28,8 +27,8 @@ Quantiles = Annotated[int, Field(ge=0, le=1_000), AfterValidator(_have_one_loss)
 class Head(NamedTuple):
     """A critic's last layer: how many outputs (..., M) it has and two functions of them.
 
-    `value(outputs)` is the mean return (...). `loss(outputs (..., B, M), target (B,) or (B, M))`
-    gives each row's loss and absolute TD error, both (..., B).
+    `value(outputs)` is the mean return (...), of NumPy arrays too. `loss(outputs, target)` of
+    (..., B, M) and (B,) or (B, M) is each row's loss and absolute TD error, both (..., B).
     """
 
     outputs: int
@@ -50,13 +49,18 @@ class Head(NamedTuple):
 def choose(quantiles: int, replay: str) -> Head:
     """The head of a learner: quantiles if it has any, else the mean with its replay's loss."""
     if quantiles:
-        return Head(quantiles, partial(jnp.mean, axis=-1), quantile_huber)
+        return Head(quantiles, mean, quantile_huber)
     return Head(1, first, lap if replay == "lap" else squared)
 
 
 def first(outputs: Array) -> Array:
     """The only output (..., 1) as the value (...)."""
     return outputs[..., 0]
+
+
+def mean(outputs: Array) -> Array:
+    """The quantiles' mean as the value (...)."""
+    return outputs.mean(axis=-1)
 
 
 def squared(outputs: Array, target: Array) -> tuple[Array, Array]:

@@ -202,8 +202,8 @@ build = SAC
 
 def explore(actor: Layers, observation: Floats, rng: np.random.Generator) -> Floats:
     """An action (A,) drawn in NumPy."""
-    mean, log_std = np.split(forward(actor, observation), 2)
-    noise = rng.standard_normal(len(mean), np.float32)
+    mean, log_std = np.split(forward(actor, observation), 2, axis=-1)
+    noise = rng.standard_normal(mean.shape, np.float32)
     return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise)
 
 

@@ -154,13 +154,17 @@ class TD3:
 
     def target(self, state: State, batch: Batch, key: Array) -> Array:
         """Clipped double-Q target y (B,), of quantiles (B, M); one noise draw a sample."""
-        limit = self.hyper.target_noise_clip
-        noise = self.hyper.target_noise * jax.random.normal(key, batch.action.shape)
-        clean = nets.actor(state.target_actor, batch.next_observation)
-        action = jnp.clip(clean + jnp.clip(noise, -limit, limit), -1, 1)
+        action = self.next_action(state, batch.next_observation, key)
         said = self.outputs(state.target_critic, batch.next_observation, action)
         following = self.head.least(said).T  # rows last, for quantiles too
         return jax.lax.stop_gradient(batch.reward + batch.discount * following).T
+
+    def next_action(self, state: State, observation: Array, key: Array) -> Array:
+        """The target actor's action (B, A) under clipped noise, which a target asks about."""
+        limit = self.hyper.target_noise_clip
+        clean = nets.actor(state.target_actor, observation)
+        noise = self.hyper.target_noise * jax.random.normal(key, clean.shape)
+        return jnp.clip(clean + jnp.clip(noise, -limit, limit), -1, 1)
 
     def outputs(self, critic: nets.Network, observation: Array, action: Array) -> Array:
         """All that every critic says (critics, B, M)."""

@@ -112,7 +112,7 @@ class Population:
 def inherit(states: Sequence[Any], parents: Parents, copy: str) -> list[Any]:
     """Each member's new state; who is its own parent goes on as it is. Of another parent, `full`
     copies everything, `weights` leaves a member its own optimiser, and `actor` gives it only the
-    parent's actor, as its target too, with fresh Adam moments.
+    parent's actor, as its target too, with fresh Adam moments and the noise that fits it.
     """
     return [
         own if parent == member else _descend(own, states[parent], copy)
@@ -131,6 +131,8 @@ def _descend(own: Any, parent: Any, copy: str) -> Any:
         new = own._replace(actor=parent.actor, actor_optimizer=fresh)
         if "target_actor" in own._fields:
             new = new._replace(target_actor=parent.actor)
+        if "sigma" in own._fields:
+            new = new._replace(sigma=parent.sigma)
     return jax.tree.map(jnp.copy, new)  # updates use up their state, so no two may share a buffer
 
 
