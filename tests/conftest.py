@@ -8,7 +8,7 @@ import pytest
 
 from pacesetter import storage
 from pacesetter.runs import RunDirectory
-from pacesetter.training.trainer import Trainer
+from pacesetter.training.trainer import Trainer, _prepare_jax
 
 CLOCKS = ("cpu_seconds", "wall_seconds")
 TINY: dict[str, Any] = {
@@ -50,6 +50,12 @@ def run_to_end(trainer: Trainer) -> RunDirectory:
     for _ in trainer:
         pass
     return trainer.directory
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _keep_compiled() -> None:
+    """Programs are kept between test runs, as a trainer keeps them."""
+    _prepare_jax("auto")
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ def random_batch(rng: np.random.Generator, spec: Spec, *shape: int) -> Batch:
 
 def random_state(algorithm: Any, rng: np.random.Generator, *networks: str) -> Any:
     """A new state in float64 whose networks are random, so that targets are unlike them."""
-    state = jax.device_get(algorithm.init(KEY))
+    state = jax.device_get(jax.jit(algorithm.init)(KEY))
     state = jax.tree.map(lambda x: x.astype(float) if x.dtype.kind == "f" else x, state)
 
     def draw(path: Any, x: Any) -> Any:
@@ -47,7 +47,7 @@ def member(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda x: x[index], tree)
 
 
-def slopes(loss: Callable[[Any], float], network: Any, step: float = 1e-6) -> Any:
+def slopes(loss: Callable[[Any], float], network: Any, step: float = 3e-6) -> Any:
     """The gradient of a NumPy loss by central differences."""
     found = jax.tree.map(np.zeros_like, network)
     for layer, slope in zip(network, found, strict=True):
@@ -96,10 +96,11 @@ def quantile_loss(outputs: Any, targets: Any) -> float:
 
 
 def squashed(said: Any, noise: Any) -> tuple[Any, Any]:
-    """Actions and log-probabilities of a tanh Gaussian in NumPy, by the formula of rlkit."""
+    """Actions and log-probabilities of a tanh Gaussian in NumPy, by log cosh."""
     mean, log_std = np.split(said, 2, axis=-1)
     log_std = np.clip(log_std, -20, 2)
     before = mean + np.exp(log_std) * noise
     action = np.tanh(before)
     gaussian = -0.5 * noise**2 - log_std - 0.5 * np.log(2 * np.pi)
-    return action, (gaussian - np.log(1 - action**2)).sum(axis=-1)
+    cosh = np.logaddexp(before, -before) - np.log(2)
+    return action, (gaussian + 2 * cosh).sum(axis=-1)

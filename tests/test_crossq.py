@@ -1,6 +1,5 @@
 """CrossQ: batch renorm by its definition, a second CrossQ in NumPy, and what acts."""
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -8,12 +7,13 @@ import numpy as np
 import pytest
 
 from numeric import KEY, close, member, mlp, random_batch, random_state, slopes, squashed
-from pacesetter import nets, renorm
+from pacesetter import renorm
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import crossq
 from pacesetter.config import settle
 from pacesetter.policy import Policy, unstack
 
+train, fold, renormalize = (jax.jit(f) for f in (renorm.train, renorm.fold, renorm.renormalize))
 SPEC = Spec(observation_size=3, action_size=2)
 
 
@@ -35,7 +35,7 @@ def test_cold_it_is_batch_norm(rng: np.random.Generator) -> None:
     """Each column ends with mean 0 and deviation 1, whatever the running statistics are."""
     x = rng.normal(3, 2, size=(256, 5)).astype(np.float32)
     layer = statistics(np.full(5, 9), np.full(5, 4))
-    normed, moved = renorm.renormalize(layer, x, np.bool_(False))
+    normed, moved = renormalize(layer, x, False)
     np.testing.assert_allclose(np.mean(normed, axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(np.std(normed, axis=0), 1, atol=1e-3)
     np.testing.assert_allclose(moved["mean"], 0.99 * 9 + 0.01 * x.mean(axis=0), rtol=1e-5)
@@ -46,17 +46,13 @@ def test_warm_it_is_what_evaluation_does(rng: np.random.Generator) -> None:
     """Within the limits the batch's own statistics cancel: the folded network says the same."""
     network = jax.tree.map(np.float32, random_state(learner(), rng, "actor").actor)
     x = rng.normal(size=(256, 3)).astype(np.float32)
-    said, _ = renorm.train(network, x, np.bool_(False))
     for _ in range(1200):  # statistics that fit the batch; 0.99^1200 is 6e-6
-        said, network = train(network, x)
-    said, _ = renorm.train(network, x * 1.1, np.bool_(True))
-    evaluated = nets.apply(renorm.fold(network), x * 1.1)
+        _, network = train(network, x, False)
+    said, _ = train(network, x * 1.1, True)
+    evaluated = mlp(jax.device_get(fold(network)), x * 1.1)
     np.testing.assert_allclose(said, evaluated, rtol=1e-3, atol=1e-4)
-    cold, _ = renorm.train(network, x * 1.1, np.bool_(False))
+    cold, _ = train(network, x * 1.1, False)
     assert np.abs(cold - said).max() > 1e-2
-
-
-train = jax.jit(partial(renorm.train, warm=np.bool_(False)))
 
 
 @pytest.mark.parametrize(("scale", "stretch"), [(100, 3), (0.001, 1 / 3), (2, 2)])
@@ -64,8 +60,8 @@ def test_stretch_has_limits(scale: float, stretch: float, rng: np.random.Generat
     """The ratio of deviations counts between 1/3 and 3."""
     x = scale * rng.normal(size=(4096, 1)).astype(np.float32)
     x = (x - x.mean()) / x.std() * np.float32(scale)
-    normed, _ = renorm.renormalize(statistics([0], [1]), x, np.bool_(True))
-    cold, _ = renorm.renormalize(statistics([0], [1]), x, np.bool_(False))
+    normed, _ = renormalize(statistics([0], [1]), x, True)
+    cold, _ = renormalize(statistics([0], [1]), x, False)
     np.testing.assert_allclose(normed, stretch * np.asarray(cold), rtol=2e-3, atol=1e-5)
 
 
@@ -74,7 +70,7 @@ def test_shift_has_limits(mean: float, shift: float, rng: np.random.Generator) -
     """The distance of means counts up to 5 running deviations."""
     x = rng.normal(size=(4096, 1))
     x = np.float32((x - x.mean()) / x.std() + mean)
-    normed, _ = renorm.renormalize(statistics([0], [1]), x, np.bool_(True))
+    normed, _ = renormalize(statistics([0], [1]), x, True)
     assert float(np.mean(normed)) == pytest.approx(shift, rel=1e-3)
 
 
@@ -82,7 +78,7 @@ def test_folded_network_normalises_by_running_statistics(rng: np.random.Generato
     """Layer by layer in NumPy; and it is a plain network, as policy files hold."""
     network = jax.tree.map(np.float32, random_state(learner(), rng, "actor").actor)
     x = rng.normal(size=(20, 3)).astype(np.float32)
-    folded = jax.device_get(renorm.fold(network))
+    folded = jax.device_get(fold(network))
     assert {frozenset(layer) for layer in folded} == {frozenset({"kernel", "bias"})}
     np.testing.assert_allclose(mlp(folded, x), evaluate(network, x), rtol=1e-4, atol=1e-5)
 
@@ -191,7 +187,7 @@ def halved(tree: Any) -> Any:
 def test_actor_moves_once_in_three(rng: np.random.Generator) -> None:
     """A cycle is three critic steps, then one of the actor and the temperature; no targets."""
     algorithm = learner(policy_delay=3)
-    state = algorithm.init(KEY)
+    state = jax.jit(algorithm.init)(KEY)
     assert not [name for name in state._fields if "target" in name]
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, 3, 8))
     update = jax.jit(algorithm.update)(state, batch, KEY)
@@ -205,10 +201,11 @@ def test_renorm_follows_the_networks_own_updates(rng: np.random.Generator) -> No
     """With `renorm_after` 2 and a delay of 1 the third update of each network is the first warm."""
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, 1, 8))
     never, soon = learner(renorm_after=10**9), learner(renorm_after=2)
-    one = other = never.init(KEY)
+    one = other = jax.jit(never.init)(KEY)
+    steps = [jax.jit(each.update) for each in (never, soon)]
     for i in range(3):
-        one = jax.jit(never.update)(one, batch, jax.random.key(i)).state
-        other = jax.jit(soon.update)(other, batch, jax.random.key(i)).state
+        one = steps[0](one, batch, jax.random.key(i)).state
+        other = steps[1](other, batch, jax.random.key(i)).state
         moments = [(s.actor_optimizer[0].mu, s.critic_optimizer[0].mu) for s in (one, other)]
         pairs = zip(*map(jax.tree.leaves, moments), strict=True)
         equal = [np.array_equal(a, b) for a, b in pairs if np.any(a != 0)]
@@ -235,7 +232,7 @@ def test_policy_and_acting_are_plain_networks(rng: np.random.Generator) -> None:
     actors, box = algorithm.policy(state), np.ones(2, np.float32)
     policy = Policy(unstack(actors), actors.activation, actors.output, -box, box)
     np.testing.assert_allclose(policy(observation), np.tanh(mean), atol=1e-5)
-    acting = jax.device_get(algorithm.acting(state))
+    acting = jax.device_get(jax.jit(algorithm.acting)(state))
     noise = np.random.default_rng(1).standard_normal(2, np.float32)
     action, _ = algorithm.act(acting, (), observation[0], np.random.default_rng(1))
     wanted = np.tanh(mean[0] + np.exp(np.clip(log_std[0], -20, 2)) * noise)

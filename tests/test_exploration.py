@@ -23,6 +23,7 @@ SPEC = Spec(observation_size=3, action_size=2)
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
 adapt = jax.jit(exploration.adapt, static_argnums=2)
+perturb, act = jax.jit(exploration.perturb), jax.jit(nets.actor)
 
 
 def learner(name: str = "td3", **hyper: Any) -> td3.TD3:
@@ -81,11 +82,11 @@ def test_distance_grows_with_sigma(rng: np.random.Generator) -> None:
     algorithm = learner()
     actor = new_state(algorithm, rng).actor
     observation = rng.normal(size=(64, 3)).astype(np.float32)
-    clean = nets.actor(actor, observation)
+    clean = act(actor, observation)
 
     def distance(sigma: float) -> float:
-        noisy = exploration.perturb(actor, np.float32(sigma), KEY)
-        return float(((nets.actor(noisy, observation) - clean) ** 2).mean() ** 0.5)
+        noisy = perturb(actor, np.float32(sigma), KEY)
+        return float(((act(noisy, observation) - clean) ** 2).mean() ** 0.5)
 
     distances = [distance(sigma) for sigma in (1e-4, 1e-3, 0.01, 0.03, 0.1)]
     assert np.all(np.diff(distances) > 0)
@@ -97,7 +98,7 @@ def test_noise_spares_the_gains_of_layer_norm(rng: np.random.Generator) -> None:
     actor = new_state(algorithm, rng).actor
     before = copy.deepcopy(actor)
     for noisy in (
-        exploration.perturb(actor, np.float32(0.3), KEY),
+        perturb(actor, np.float32(0.3), KEY),
         algorithm.begin((actor, np.float32(0.3)), rng),
     ):
         for clean, layer in zip(actor, noisy, strict=True):
@@ -122,7 +123,7 @@ def test_noise_spares_the_gains_of_layer_norm(rng: np.random.Generator) -> None:
 def test_sigma_adapts_every_50_updates(delay: int, rng: np.random.Generator) -> None:
     """In the cycle that reaches or passes 50, 100, 150 updates, and in no other."""
     algorithm = learner(policy_delay=delay, batch_size=4)
-    state, moved = algorithm.init(KEY), []
+    state, moved = jax.jit(algorithm.init)(KEY), []
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, delay, 4))
     update = jax.jit(algorithm.update)
     assert float(state.sigma) == np.float32(0.1)

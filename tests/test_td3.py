@@ -15,7 +15,7 @@ from pacesetter.algorithm import Batch, Spec
 from pacesetter.algorithms.td3 import TD3, State
 from pacesetter.config import settle
 from pacesetter.policy import Policy, load, to_env, unstack
-from pacesetter.training.trainer import Trainer, _prepare_jax
+from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(3)
@@ -35,9 +35,9 @@ def _asked(algorithm: TD3, state: State, batch: Batch, key: Any) -> list[Any]:
     seen: list[Any] = []
 
     class Spy(TD3):
-        def values(self, critic: Any, observation: Any, action: Any) -> Any:
+        def outputs(self, critic: Any, observation: Any, action: Any) -> Any:
             seen.append(action)
-            return super().values(critic, observation, action)
+            return super().outputs(critic, observation, action)
 
     Spy(algorithm.spec, algorithm.hyper).target(state, batch, key)
     return seen
@@ -50,12 +50,6 @@ fit_critic = _compiled(TD3.fit_critic)
 fit_actor = _compiled(TD3.fit_actor)
 values = _compiled(TD3.values)
 asked = _compiled(_asked)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _keep_compiled() -> None:
-    """Programs are kept between test runs, as a trainer keeps them."""
-    _prepare_jax("auto")
 
 
 def learner(name: str = "td3", spec: Spec = SPEC, **hyper: Any) -> TD3:
@@ -146,7 +140,7 @@ def test_minimum_is_taken_sample_by_sample(
 ) -> None:
     """Either twin may be the smaller one."""
     given = np.array([[1, 5, -3], [2, 4, -4]], np.float32)
-    monkeypatch.setattr(TD3, "values", lambda *_: given)
+    monkeypatch.setattr(TD3, "outputs", lambda *_: given[..., None])
     batch = minibatches(3)._replace(reward=np.zeros(3), discount=np.ones(3))
     algorithm = learner()
     y = jax.jit(algorithm.target)(fresh(algorithm), batch, KEY)

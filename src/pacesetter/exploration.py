@@ -28,19 +28,21 @@ class Exploration(NamedTuple):
     act: Callable[[Any, Any, Floats, float, Draw], tuple[Floats, Any]]
 
 
+def _normal(shape: tuple[int, ...], scale: float, rng: Draw) -> Floats:
+    return np.float32(scale) * rng.standard_normal(shape, np.float32)
+
+
 def _gaussian(
     actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
 ) -> tuple[Floats, Any]:
     action: Floats = np.tanh(forward(actor, observation))
-    noise = np.float32(scale) * rng.standard_normal(action.shape, np.float32)
-    return action + noise, memory
+    return action + _normal(action.shape, scale, rng), memory
 
 
 def _ou(
     actor: Layers, memory: Floats, observation: Floats, scale: float, rng: Draw
 ) -> tuple[Floats, Any]:
-    kick = np.float32(scale) * rng.standard_normal(len(memory), np.float32)
-    moved = np.add((1 - OU_PULL) * memory, kick, dtype=np.float32)
+    moved = np.add((1 - OU_PULL) * memory, _normal(memory.shape, scale, rng), dtype=np.float32)
     return np.tanh(forward(actor, observation)) + moved, moved
 
 
@@ -48,7 +50,7 @@ def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:
     actor, sigma = acting
 
     def noisy(value: Floats) -> Floats:
-        return value + np.float32(sigma) * rng.standard_normal(value.shape, np.float32)
+        return value + _normal(value.shape, sigma, rng)
 
     return tuple(
         {name: noisy(value) if name in NOISY else value for name, value in layer.items()}
