@@ -22,7 +22,7 @@ from pacesetter.training.trainer import Trainer
 SPEC = Spec(observation_size=3, action_size=2)
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
-adapt = jax.jit(exploration.adapt, static_argnums=2)
+adapt = jax.jit(exploration.adapt_sigma, static_argnums=2)
 perturb, act = jax.jit(exploration.perturb), jax.jit(nets.actor)
 
 

@@ -1,11 +1,12 @@
 """How a deterministic actor explores: noise on its actions, or on its own weights."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pydantic import AfterValidator, ValidationInfo
 
 from pacesetter import nets
 from pacesetter.policy import Floats, Layers, forward
@@ -17,6 +18,15 @@ SIGMA_RANGE = (1e-4, 1.0)  # where tanh saturates, distance no longer tells of s
 NOISY = ("kernel", "bias")  # and not the gains of layer norm
 Array = jax.Array
 Draw = np.random.Generator
+
+
+def _fits_all_layers(kind: str, info: ValidationInfo) -> str:
+    if kind == "parameter" and not info.data.get("actor_layer_norm"):
+        raise ValueError("needs --actor-layer-norm, so that one deviation fits all layers")
+    return kind
+
+
+Kind = Annotated[Literal["gaussian", "ou", "parameter"], AfterValidator(_fits_all_layers)]
 
 
 class Exploration(NamedTuple):
@@ -78,7 +88,9 @@ def first_sigma(goal: float) -> Array:
     return jnp.clip(jnp.asarray(goal, jnp.float32), *SIGMA_RANGE)
 
 
-def adapt(sigma: Array, actor: nets.Network, goal: float, observation: Array, key: Array) -> Array:
+def adapt_sigma(
+    sigma: Array, actor: nets.Network, goal: float, observation: Array, key: Array
+) -> Array:
     """Sigma moved 1% towards where noisy actions are `goal` from clean ones (Plappert et al. 2018,
     appendix C), on a batch of observations (B, O) and with a noisy copy drawn for this alone.
     """

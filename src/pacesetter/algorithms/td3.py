@@ -10,27 +10,22 @@ move all targets a little towards their networks
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import exploration, heads, nets
+from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.config import STRICT, OffPolicy, Width
+from pacesetter.exploration import ADAPT_EVERY, KINDS, Kind, adapt_sigma, first_sigma
 from pacesetter.policy import Actors, Floats
 
 UNROLLED = 4  # critic steps a loop; without one, XLA need not copy states between iterations
-
-
-def _needs_layer_norm(kind: str, info: ValidationInfo) -> str:
-    if kind == "parameter" and not info.data.get("actor_layer_norm"):
-        raise ValueError("is on weights that one deviation must fit; add --actor-layer-norm")
-    return kind
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -52,9 +47,7 @@ class Hyper(OffPolicy):
     quantiles: heads.Quantiles = Field(
         0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
     )
-    exploration: Annotated[
-        Literal["gaussian", "ou", "parameter"], AfterValidator(_needs_layer_norm)
-    ] = Field("gaussian", description="noise on actions, or on the actor's weights")
+    exploration: Kind = Field("gaussian", description="noise on actions, or on the actor's weights")
     exploration_noise: float = Field(
         0.1, ge=0, description="deviation of that noise, for parameter of the actions it causes"
     )
@@ -108,20 +101,20 @@ class TD3:
             actor_optimizer=self._actor_adam.init(actor),
             critic_optimizer=self._critic_adam.init(critic),
             updates=jnp.zeros((), jnp.int32),
-            sigma=exploration.first_sigma(self.hyper.exploration_noise) if noisy else None,
+            sigma=first_sigma(self.hyper.exploration_noise) if noisy else None,
         )
 
     def acting(self, state: State) -> Any:
         return state.actor if state.sigma is None else (state.actor, state.sigma)
 
     def begin(self, acting: Any, rng: np.random.Generator) -> Any:
-        kind = exploration.KINDS[self.hyper.exploration]
+        kind = KINDS[self.hyper.exploration]
         return kind.begin(acting, self.spec.action_size, rng)
 
     def act(
         self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        kind = exploration.KINDS[self.hyper.exploration]
+        kind = KINDS[self.hyper.exploration]
         return kind.act(acting, memory, observation, self.hyper.exploration_noise, rng)
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
@@ -217,8 +210,8 @@ class TD3:
         """Parameter noise adapted, if this cycle has passed a multiple of 50 updates."""
         goal = self.hyper.exploration_noise
         sigma = jax.lax.cond(
-            state.updates % exploration.ADAPT_EVERY < self.cycle,
-            lambda sigma: exploration.adapt(sigma, state.actor, goal, batch.observation, key),
+            state.updates % ADAPT_EVERY < self.cycle,
+            lambda sigma: adapt_sigma(sigma, state.actor, goal, batch.observation, key),
             lambda sigma: sigma,
             state.sigma,
         )
