@@ -5,6 +5,8 @@ does hits all of them. That is not enough for torch: when its threads wait for a
 somebody else holds, SB3 slows down by far more than its share. So what others took is measured,
 and a disturbed run says so. OMP_NUM_THREADS=1 in front gives torch one thread.
 
+An ensemble has no peer: its cost is set beside what flops.py counts for it.
+
 Run by `make bench-speed`; see --help for other tasks and lengths.
 """
 
@@ -34,9 +36,14 @@ class Algorithm(NamedTuple):
     """What to train here and in the peers: settings beyond those below, which all share."""
 
     ours: Settings
-    peer: str
+    peer: str | None
     theirs: Settings
     noise: float | None = None
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Who has it."""
+        return ("pacesetter", *PEERS) if self.peer else ("pacesetter",)
 
 
 RATE = 3e-4
@@ -56,9 +63,10 @@ ALGORITHMS = {
     "td3": Algorithm(
         OUR_RATES | {"policy_delay": 2, "exploration_noise": 0.1}, "TD3", {"policy_delay": 2}, 0.1
     ),
+    "sac": Algorithm(OUR_RATES | {"alpha_learning_rate": RATE}, "SAC", {"ent_coef": "auto"}),
+    "sunrise": Algorithm(OUR_RATES | {"alpha_learning_rate": RATE, "ensemble": 5}, None, {}),
 }
 PEERS = {"SB3": "stable_baselines3", "SBX": "sbx"}
-LIBRARIES = ("pacesetter", *PEERS)
 TARGETS = {
     ("td3", "HalfCheetah-v5", "SB3"): 3.5,
     ("td3", "HalfCheetah-v5", "SBX"): 1.8,
@@ -89,7 +97,7 @@ def time_ours(name: str, env: str, steps: int, seed: int) -> float:
 def time_peer(library: str, name: str, env: str, steps: int, seed: int) -> float:
     """Steps/s of a peer between two calls of its callback, at the same steps as ours."""
     algorithm = ALGORITHMS[name]
-    learner = getattr(importlib.import_module(PEERS[library]), algorithm.peer)
+    learner = getattr(importlib.import_module(PEERS[library]), str(algorithm.peer))
     settings = THEIRS | algorithm.theirs
     if algorithm.noise is not None:
         settings["action_noise"] = gaussian(env, algorithm.noise)
@@ -154,10 +162,11 @@ def measure_apart(library: str, name: str, env: str, steps: int, seed: int) -> t
 
 def measure_all(name: str, env: str, steps: int, repeats: int) -> tuple[Rates, float]:
     """All libraries in turn, again and again; and the most cores that others kept busy."""
-    rates: Rates = {library: [] for library in LIBRARIES}
+    libraries = ALGORITHMS[name].libraries
+    rates: Rates = {library: [] for library in libraries}
     most = 0.0
     for seed in range(repeats):
-        for library in LIBRARIES:
+        for library in libraries:
             found, taken = measure_apart(library, name, env, steps, seed)
             rates[library].append(found)
             most = max(most, taken)
@@ -181,6 +190,18 @@ def ratio_line(name: str, env: str, peer: str, rates: Rates) -> str:
     return f"{label} = {median(ratios):.2f} (median of {len(ratios)} pairwise ratios{aim})"
 
 
+def cost_line(name: str, env: str, base: str, rate: float, base_rate: float) -> str:
+    """How much a step costs of another learner's, by the clock and by its operations."""
+    import flops
+
+    spec = flops.spec_of(env)
+    ours, theirs = (flops.megaflops(x, spec, **ALGORITHMS[x].ours) for x in (name, base))
+    return (
+        f"{name} {env}: a step takes {base_rate / rate:.1f} times that of {base} "
+        f"(ratio of medians; learning takes {ours / theirs:.1f} times the operations)"
+    )
+
+
 def machine() -> str:
     """Versions, cores and torch's threads."""
     import torch
@@ -194,7 +215,7 @@ def machine() -> str:
 def report(name: str, env: str, rates: Rates, taken: float) -> None:
     """Print the table and the ratios of a task, and whether they are worth anything."""
     print(f"\n{name} {env}\n\n{table(rates)}\n")
-    for peer in PEERS:
+    for peer in (x for x in rates if x in PEERS):
         print(ratio_line(name, env, peer, rates))
     if taken > DISTURBED:
         print(f"DISTURBED, not a result: others kept up to {taken:.2f} cores busy meanwhile")
@@ -212,7 +233,7 @@ def timed_steps(text: str) -> int:
 def options() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description="Compare training speed with SB3 and SBX.")
-    parser.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=["td3"])
+    parser.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=[*ALGORITHMS])
     parser.add_argument("--env", nargs="+", default=["HalfCheetah-v5"])
     parser.add_argument("--steps", type=timed_steps, default=3_000, help="timed steps")
     parser.add_argument("--repeats", type=int, default=3, help="rounds over all libraries")
@@ -228,9 +249,15 @@ def main() -> None:
         print(measure(library, name, env, int(steps), int(seed)))
         return
     print(f"{machine()}; {chosen.steps} timed steps, {chosen.repeats} rounds", flush=True)
-    for name in chosen.algorithm:
-        for env in chosen.env:
-            report(name, env, *measure_all(name, env, chosen.steps, chosen.repeats))
+    for env in chosen.env:
+        medians: dict[str, float] = {}
+        for name in chosen.algorithm:
+            rates, taken = measure_all(name, env, chosen.steps, chosen.repeats)
+            report(name, env, rates, taken)
+            medians[name] = median(rates["pacesetter"])
+            if ALGORITHMS[name].peer is None:
+                for base in (x for x in medians if ALGORITHMS[x].peer):
+                    print(cost_line(name, env, base, medians[name], medians[base]), flush=True)
 
 
 if __name__ == "__main__":

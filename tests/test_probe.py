@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import TINY, run_to_end
+from pacesetter.algorithms.sunrise import Sunrise
 from pacesetter.training.trainer import Trainer
 
 LEARNS: dict[str, Any] = {
@@ -29,6 +30,7 @@ NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can s
     "exploration_noise": None,
 }
 CROSSQ = NO_ENTROPY | {"critic_hidden": (64, 64), "tau": None, "steps": 2_000}
+FEW = {"ensemble": 3}
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -42,6 +44,8 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "sac-quantiles": ("sac", NO_ENTROPY | {"quantiles": 25}),
     "parameter": ("td3", NOISY),
     "ddpg-parameter": ("ddpg", NOISY),
+    "sunrise": ("sunrise", NO_ENTROPY | FEW),
+    "sunrise-td3": ("sunrise-td3", FEW),
 }
 
 
@@ -65,11 +69,17 @@ def learn(kind: str, env: str, runs: Path, **kwargs: Any) -> Trainer:
 
 
 def values(trainer: Trainer, observation: float, actions: Any = (-0.8, 0.0, 0.8)) -> Any:
-    """Every critic's value (critics, actions) of actions in [-1, 1]."""
+    """Every critic's value (..., critics, actions) of actions in [-1, 1]."""
     critic = jax.device_get(trainer.ensemble.states[0].critic)
     action = np.array(actions, np.float32)[:, None]
     algorithm: Any = trainer.ensemble.algorithm
-    return jax.jit(algorithm.values)(critic, np.full_like(action, observation), action)
+    ask = algorithm.values if hasattr(algorithm, "values") else members_values(algorithm)
+    return jax.jit(ask)(critic, np.full_like(action, observation), action)
+
+
+def members_values(algorithm: Sunrise) -> Any:
+    """The values of all learners in an ensemble (N, critics, actions)."""
+    return jax.vmap(algorithm.base.learner.values, (0, None, None))
 
 
 def near(found: Any, expected: Any) -> None:

@@ -39,6 +39,15 @@ CASES = {
         "critic_hidden": (16, 16),
         "renorm_after": 100,
     },
+    "sunrise": {"env": "Hopper-v5", "algorithm": "sunrise", "ensemble": 3},
+    "one-of-sunrise": {  # its random learner of an episode, and blocks of updates
+        "env": "Hopper-v5",
+        "algorithm": "multi-sunrise-td3",
+        "ensemble": 3,
+        "reference": "official",
+        "ucb": 0,
+        "update_every": 50,
+    },
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
 }
 
@@ -62,7 +71,16 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
-SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
+SLOW = (
+    "normalized",
+    "sac",
+    "ou",
+    "own-replays",
+    "quantiles",
+    "crossq",
+    "sunrise",
+    "one-of-sunrise",
+)
 
 
 @pytest.mark.parametrize(

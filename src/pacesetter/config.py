@@ -46,6 +46,17 @@ def _rule(value: str) -> str:
     return value
 
 
+def only(value: float) -> AfterValidator:
+    """A setting that this algorithm fixes."""
+
+    def check(given: float) -> float:
+        if given != value:
+            raise ValueError(f"is fixed for this algorithm; allowed: {value}")
+        return given
+
+    return AfterValidator(check)
+
+
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
 Duration = Annotated[float, BeforeValidator(_duration)]
@@ -72,6 +83,14 @@ class OffPolicy(Hyper):
     update_at: Literal["step", "episode"] = Field(
         "step", description="as they fall due, or all at the episode's end"
     )
+    update_every: Count | None = Field(
+        None, ge=1, description="own steps between blocks of updates; none is 1"
+    )
+
+    @property
+    def block(self) -> int:
+        """Own env steps after which the updates that have fallen due are made."""
+        return self.update_every or 1
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

@@ -21,6 +21,10 @@ TABLE = {
     "crossq": Entry(
         "pacesetter.algorithms.crossq", "SAC with batch renorm and no targets (Bhatt et al. 2024)"
     ),
+    "sunrise": Entry(
+        "pacesetter.algorithms.sunrise", "an ensemble of SAC learners (Lee et al. 2021)"
+    ),
+    "sunrise-td3": Entry("pacesetter.algorithms.sunrise_td3", "SUNRISE's ensemble over TD3"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
 }
 

@@ -6,23 +6,12 @@ One critic, no delay, no noise on the target action; everything else is TD3's. T
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import td3
-from pacesetter.config import STRICT
-
-
-def only(value: float) -> AfterValidator:
-    """A setting that this algorithm fixes."""
-
-    def check(given: float) -> float:
-        if given != value:
-            raise ValueError(f"is fixed for this algorithm; allowed: {value}")
-        return given
-
-    return AfterValidator(check)
+from pacesetter.config import STRICT, only
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -140,10 +140,15 @@ class SAC:
 
     def target(self, state: State, batch: Batch, key: Array) -> Array:
         """Soft target y (B,), of quantiles (B, M)."""
-        action, log_prob = sample(state.actor, batch.next_observation, key)
+        action, bonus = self.next_action(state, batch.next_observation, key)
         said = nets.each(nets.outputs, state.target_critic, batch.next_observation, action)
-        soft = self.head.least(said).T - jnp.exp(state.log_alpha) * log_prob
-        return jax.lax.stop_gradient(batch.reward + batch.discount * soft).T
+        following = self.head.least(said).T + bonus  # rows last, for quantiles too
+        return jax.lax.stop_gradient(batch.reward + batch.discount * following).T
+
+    def next_action(self, state: State, observation: Array, key: Array) -> tuple[Array, Array]:
+        """The action (B, A) that a target asks about, and its entropy's worth (B,)."""
+        action, log_prob = sample(state.actor, observation, key)
+        return action, -jnp.exp(state.log_alpha) * log_prob
 
     def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
@@ -170,21 +175,23 @@ class SAC:
         )
         return state, value, error
 
-    def fit_actor(self, state: State, batch: Batch, key: Array) -> tuple[State, dict[str, Array]]:
+    def fit_actor(
+        self, state: State, batch: Batch, key: Array, weight: Array | float = 1.0
+    ) -> tuple[State, dict[str, Array]]:
         """One Adam step of the actor on the given critics, and one of the temperature."""
         alpha = jnp.exp(state.log_alpha)
 
         def loss(actor: nets.Network) -> tuple[Array, Array]:
             action, log_prob = sample(actor, batch.observation, key)
             values = self.values(state.critic, batch.observation, action).min(axis=0)
-            return (alpha * log_prob - values).mean(), log_prob.mean()
+            return (weight * (alpha * log_prob - values)).mean(), (weight * log_prob).mean()
 
         (value, log_prob), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = optax.adam(self.hyper.actor_learning_rate)
         actor, optimizer = nets.descend(adam, state.actor, gradient, state.actor_optimizer)
         state = state._replace(actor=actor, actor_optimizer=optimizer)
         losses = {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
-        return fit_temperature(self, state, log_prob), losses
+        return fit_temperature(self, state, log_prob, jnp.mean(weight)), losses
 
     def _new_critic(self, key: Array) -> nets.Network:
         inputs = self.spec.observation_size + self.spec.action_size
@@ -215,11 +222,13 @@ def mean_policy(actor: nets.Network, size: int) -> Actors:
     return Actors(one, activation="relu", output="tanh")
 
 
-def fit_temperature(learner: Any, state: Any, log_prob: Array) -> Any:
-    """One Adam step of the temperature; too little entropy raises it."""
+def fit_temperature(learner: Any, state: Any, log_prob: Array, share: Array | float = 1.0) -> Any:
+    """One Adam step of the temperature; too little entropy raises it. `share` is the mean weight
+    of the rows behind the mean `log_prob`.
+    """
     hyper = learner.hyper
     wanted = -learner.spec.action_size if hyper.target_entropy is None else hyper.target_entropy
-    excess = -log_prob - wanted  # d/dlog_alpha of log_alpha * excess entropy
+    excess = -log_prob - share * wanted  # d/dlog_alpha of log_alpha * excess entropy
     adam = optax.adam(hyper.alpha_learning_rate)
     log_alpha, optimizer = nets.descend(adam, state.log_alpha, excess, state.alpha_optimizer)
     return state._replace(log_alpha=log_alpha, alpha_optimizer=optimizer)

@@ -184,14 +184,16 @@ class TD3:
         state = state._replace(critic=critic, critic_optimizer=optimizer, updates=state.updates + 1)
         return state, value, error
 
-    def fit_actor(self, state: State, batch: Batch) -> tuple[State, Array]:
+    def fit_actor(
+        self, state: State, batch: Batch, weight: Array | float = 1.0
+    ) -> tuple[State, Array]:
         """One Adam step of the actor up critic 1, then one soft step of all targets."""
         first = jax.tree.map(lambda x: x[0], state.critic)
 
         def loss(actor: nets.Network) -> Array:
             action = nets.actor(actor, batch.observation)
             said = nets.outputs(first, batch.observation, action, self.action_layer)
-            return -self.head.value(said).mean()
+            return -(weight * self.head.value(said)).mean()
 
         value, gradient = jax.value_and_grad(loss)(state.actor)
         actor, optimizer = nets.descend(

@@ -180,10 +180,12 @@ class Ensemble:
 
     def learn(self) -> None:
         """Every member that owes a cycle of updates makes it, on its own minibatches."""
-        cycle, at_end = self.algorithm.cycle, self.config.hyper.update_at == "episode"
+        hyper, cycle = self.config.hyper, self.algorithm.cycle
+        at_end, block = hyper.update_at == "episode", hyper.block
 
         def ready(member: Member) -> bool:
-            return member.owed >= cycle and not (at_end and member.active)
+            early = member.steps % block != 0 or (at_end and member.active)
+            return member.owed >= cycle and not early
 
         while members := [k for k, member in self.progress.each() if ready(member)]:
             self._update(members)
