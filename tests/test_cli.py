@@ -295,6 +295,12 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--critic-decay 0.01 --output-bound 0.003 --critics 1 --policy-delay 1 --target-noise 0",
         {},
     ),
+    "crossq": (
+        "--steps 200 --hidden 8 --critic-hidden 8 6 --batch-size 8 --warmup 50 --critics 3 "
+        "--policy-delay 2 --adam-momentum 0.9 --renorm-after 20 --alpha-learning-rate 1e-2 "
+        "--initial-alpha 0.5 --target-entropy -1 --exploration policy",
+        {},
+    ),
 }
 
 
@@ -307,7 +313,7 @@ def typed(text: str) -> dict[str, Any]:
             table[flag.removeprefix("no-").replace("-", "_")] = not flag.startswith("no-")
             continue
         found = [_number(value) for value in values]
-        table[flag.replace("-", "_")] = found if flag == "hidden" else found[0]
+        table[flag.replace("-", "_")] = found if flag.endswith("hidden") else found[0]
     return table
 
 
