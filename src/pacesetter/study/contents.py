@@ -248,8 +248,6 @@ def selections(comparison: Comparison) -> list[Table]:
         for run in chosen:
             found = lineage.Selections.of(run.selections)
             count, flips = len(found.gaps), found.flips.mean()
-            path = found.line
-            took = float(np.mean(found.champions[1:] != found.champions[:-1])) if count > 1 else 0
             rows.append(
                 [
                     word(group.env),
@@ -258,20 +256,18 @@ def selections(comparison: Comparison) -> list[Table]:
                     number(count),
                     number(float(np.median(found.ratios)), 2),
                     number(100 * flips, 0, "%"),
-                    number(100 * took, 0, "%"),
                     word(found.founding),
-                    word(lineage.shorten(path)),
+                    word(lineage.shorten(found.line)),
                 ]
             )
         used += [group] if chosen else []
     if not rows:
         return []
     headers = ["env", "algorithm", "seed", "selections", "median gap / error", "coin flips"]
-    headers += ["another wins", "founder", "line of the champion"]
+    headers += ["founder", "line of the champion"]
     notes = [
         "Gap: the best member's mean return less the next one's, over the standard error of such a "
-        "gap. Coin flips: selections with a gap below one standard error. Another wins: the place "
-        "of the winner is not the one of the selection before.",
+        "gap. Coin flips: selections with a gap below one standard error.",
         "Founder: the member all descend from, and the selection since when. Line: the places "
         "through which the final champion descends, from the first selection to the last.",
     ]

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pacesetter.study import stats
-from pacesetter.study.comparison import Comparison, Group, split
+from pacesetter.study.comparison import Comparison, Group
 from pacesetter.study.contents import shared
-from pacesetter.study.published import scale
 from pacesetter.study.results import Run
 from pacesetter.study.stats import Array
 
@@ -66,7 +65,7 @@ def _rising(x: Array, y: Array) -> tuple[Array, Array]:
 def profiles(comparison: Comparison) -> tuple[str, dict[str, Curve]] | None:
     """Axis label and performance profile of each algorithm, on scores or, on one task, returns."""
     if scores := shared(comparison):
-        label = f"score: {comparison.metric} return over {_scales(comparison)}"
+        label = f"score: {comparison.metric} return over TD3's published one"
     elif len(comparison.envs) == 1:
         env = comparison.envs[0]
         label = f"{comparison.metric} return, {env}"
@@ -82,8 +81,3 @@ def profiles(comparison: Comparison) -> tuple[str, dict[str, Curve]] | None:
     return label, {
         name: Curve(levels, *stats.profile(tasks, levels)) for name, tasks in scores.items()
     }
-
-
-def _scales(comparison: Comparison) -> str:
-    tasks = dict.fromkeys(split(env)[0] for env in comparison.envs)
-    return ", ".join(f"{scale(task):,.0f} ({task})" for task in tasks if scale(task))

@@ -99,6 +99,7 @@ def figure_2(comparison: Comparison, window: int | None = None) -> Any:
                 panel.legend(frameon=False, fontsize="small")
             else:
                 panel.text(0.5, 0.5, "no runs", ha="center", transform=panel.transAxes)
+                panel.set(xticks=[], yticks=[], ylabel="")
     figure.suptitle(
         "The paper's figure 2: return against env steps of all members, mean over seeds and 95% t "
         f"interval{_smoothed(window)}",

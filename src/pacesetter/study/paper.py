@@ -124,9 +124,9 @@ def _rows(source: Source, task: str, budget: int | None) -> Iterator[list[Cell]]
     if task not in source["returns"] or "said" in source:
         return
     values = source["returns"][task]
-    at = source.get("budget", CURVE_BUDGET)
+    at: int = source.get("budget") or CURVE_BUDGET
     if "budgets" in source:  # a curve, of which we show our budget if it is there
-        at = budget if budget in source["budgets"] else at
+        at = budget if budget is not None and budget in source["budgets"] else at
         values = values[source["budgets"].index(at)]
     over = f", {source['spread']}" if "spread" in source else ""
     yield [
@@ -135,6 +135,6 @@ def _rows(source: Source, task: str, budget: int | None) -> Iterator[list[Cell]]
         _spread(values, f" ({source['version']})"),
         word(f"{source['metric']}{over}"),
         word(source.get("seeds", "-")),
-        word(steps(float(at))),
-        word(f"{source['who']}: {source['cite']}"),
+        word(steps(at)),
+        word(source["cite"]),
     ]

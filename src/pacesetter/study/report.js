@@ -27,7 +27,7 @@ for (const cell of document.querySelectorAll("td")) {
 
 // Charts.
 const data = JSON.parse(document.getElementById("data").textContent);
-const WIDTH = 600, HEIGHT = 360, LEFT = 62, RIGHT = 14, TOP = 10, BOTTOM = 46;
+const HEIGHT = 340, LEFT = 62, RIGHT = 14, TOP = 10, BOTTOM = 46;
 const shown = new Set(Object.keys(data.styles));
 let axis = "steps", seeds = false;
 
@@ -85,7 +85,7 @@ class Chart {
     const box = element("figure", { class: "chart" }, parent);
     element("h3", {}, box, spec.title);
     this.svg = element("svg", {
-      viewBox: `0 0 ${WIDTH} ${HEIGHT}`, tabindex: "0", role: "img",
+      height: HEIGHT, tabindex: "0", role: "img",
       "aria-label": `${spec.title}: ${spec.y}. Left and right arrow keys read the values.`,
     }, box);
     this.values = element("p", { class: "values", "aria-live": "polite" }, box);
@@ -98,6 +98,7 @@ class Chart {
 
   draw() {
     const spec = this.spec;
+    this.width = Math.max(this.svg.clientWidth, 240);
     this.axis = spec.axes[axis] === undefined ? Object.keys(spec.axes)[0] : axis;
     this.lines = Object.entries(spec.lines[this.axis]).filter(([name]) => shown.has(name));
     const single = seeds ? this.lines.flatMap(([name]) => (spec.seeds[name] || [])
@@ -107,7 +108,7 @@ class Chart {
     [this.low, this.high] = extent(xs);
     const [bottom, top] = extent(ys.concat(single.flatMap((one) => one[2])));
     const pad = (top - bottom) * 0.04;
-    this.x = (at) => LEFT + (at - this.low) / (this.high - this.low) * (WIDTH - LEFT - RIGHT);
+    this.x = (at) => LEFT + (at - this.low) / (this.high - this.low) * (this.width - LEFT - RIGHT);
     this.y = (at) => TOP + (top + pad - at) / (top - bottom + 2 * pad) * (HEIGHT - TOP - BOTTOM);
     this.svg.replaceChildren();
     this.frame(bottom - pad, top + pad);
@@ -121,17 +122,17 @@ class Chart {
   frame(bottom, top) {
     for (const at of ticks(bottom, top)) {
       const y = this.y(at);
-      element("line", { class: "grid", x1: LEFT, x2: WIDTH - RIGHT, y1: y, y2: y }, this.svg);
+      element("line", { class: "grid", x1: LEFT, x2: this.width - RIGHT, y1: y, y2: y }, this.svg);
       element("text", { x: LEFT - 6, y: y + 4, "text-anchor": "end" }, this.svg, short(at));
     }
-    for (const at of ticks(this.low, this.high)) {
+    for (const at of ticks(this.low, this.high, this.width / 110)) {
       const x = this.x(at);
       const end = HEIGHT - BOTTOM;
       element("line", { class: "grid", x1: x, x2: x, y1: TOP, y2: end }, this.svg);
-      const anchor = x > WIDTH - RIGHT - 16 ? "end" : "middle";
+      const anchor = x > this.width - RIGHT - 16 ? "end" : "middle";
       element("text", { x, y: end + 17, "text-anchor": anchor }, this.svg, short(at));
     }
-    const middle = (LEFT + WIDTH - RIGHT) / 2;
+    const middle = (LEFT + this.width - RIGHT) / 2;
     element("text", { x: middle, y: HEIGHT - 8, "text-anchor": "middle" }, this.svg,
       this.spec.axes[this.axis]);
     const half = (HEIGHT - BOTTOM + TOP) / 2;
@@ -155,9 +156,8 @@ class Chart {
   }
 
   follow(event) {
-    const box = this.svg.getBoundingClientRect();
-    const at = (event.clientX - box.left) / box.width * WIDTH;
-    this.read(this.low + (at - LEFT) / (WIDTH - LEFT - RIGHT) * (this.high - this.low));
+    const at = event.clientX - this.svg.getBoundingClientRect().left;
+    this.read(this.low + (at - LEFT) / (this.width - LEFT - RIGHT) * (this.high - this.low));
   }
 
   step(event) {
@@ -220,4 +220,9 @@ for (const [name, [colour, dashes]] of Object.entries(data.styles)) {
   label.insertBefore(sample, label.lastChild);
 }
 control("names", "checkbox", "each seed", false, (on) => { seeds = on; });
+let width = 0;
+new ResizeObserver(([{ contentRect }]) => {
+  if (contentRect.width !== width) redraw();
+  width = contentRect.width;
+}).observe(document.getElementById("charts"));
 redraw();

@@ -71,7 +71,7 @@ def report(
         figure_2=Markup(svg(drawn)) if drawn is not None else "",
         descents=list(_descents(comparison)),
         films=[_film(run) for run in _champions(comparison)] if film else [],
-        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        command=shlex.join(["pacesetter", *sys.argv[1:]]),
         own=", ".join(f"{name} {number}" for name, number in versions().items()),
         style=Markup((HERE / "report.css").read_text()),
         script=Markup((HERE / "report.js").read_text()),
@@ -86,7 +86,7 @@ def _embed(table: Any) -> Markup:
 def _charts(comparison: Comparison, window: int | None) -> list[dict[str, Any]]:
     charts: list[dict[str, Any]] = []
     for env in comparison.envs:
-        groups = [group for group in comparison.groups if group.env == env]
+        groups = [g for name in comparison.names if (g := comparison.find(env, name))]
         lines = {
             axis: {group.name: _line(curve(group, axis, window)) for group in groups}
             for axis in AXES

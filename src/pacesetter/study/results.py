@@ -171,7 +171,7 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         if not np.isfinite(arrays).all():
             raise ValueError("an evaluation is not finite")
         hash((run.env, run.name, run.seed, run.budget))  # all there and of the right kind
-    except (ValueError, KeyError, TypeError, ZeroDivisionError) as error:
+    except (ValueError, LookupError, TypeError, ZeroDivisionError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else error
         raise UsageError(f"{source}: damaged or foreign: {reason}") from None
     return run
