@@ -16,6 +16,7 @@ from pacesetter.flags import Parser, add_settings, parser, split_env_kwargs
 if TYPE_CHECKING:
     from pacesetter.training.trainer import Trainer
 
+_OUTPUT_HELP = ".html report, .md or .tex tables, .pdf curves; may be given several times"
 NOUNS = ("algorithms", "envs", "rules", "presets", "runs")
 
 
@@ -163,12 +164,53 @@ def show(words: list[str]) -> int:
     return 0
 
 
+def compare(words: list[str]) -> int:
+    """Compare runs: statistics, tables, curves, a report."""
+    command = parser("compare", "Compare runs, grouped by env and name: tables, curves, a report.")
+    command.add_argument(
+        "run",
+        nargs="+",
+        metavar="RUN",
+        help="folders, tails or patterns of runs, or .jsonl results",
+    )
+    command.add_argument("--metric", default="final", metavar="X", help="final, auc or max")
+    command.add_argument("--budget", metavar="N", help="count every run up to N env steps only")
+    command.add_argument("--reference", default="td3", metavar="NAME", help="control; default td3")
+    command.add_argument("--published", action="store_true", help="add published returns")
+    command.add_argument("--mixed", action="store_true", help="allow unlike versions and budgets")
+    command.add_argument("--smooth", type=int, metavar="N", help="smooth curves over N evaluations")
+    command.add_argument("--no-film", action="store_true", help="no video in the report")
+    command.add_argument("-o", action="append", default=[], metavar="FILE", help=_OUTPUT_HELP)
+    command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
+    found = command.parse(words)
+    from pacesetter.study import output
+    from pacesetter.study.comparison import compare
+
+    options = output.Options(found.published, found.smooth, not found.no_film)
+    paths = output.check(found.o, options)
+    comparison = compare(
+        found.run,
+        below=found.runs,
+        metric=found.metric,
+        budget=found.budget,
+        reference=found.reference,
+        mixed=found.mixed,
+    )
+    for path in paths:
+        output.write(comparison, path, options)
+        print(path)
+    if not paths:
+        print(output.text(comparison, options))
+    return 0
+
+
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
     "resume": resume,
     "eval": evaluate,
     "list": list_,
     "show": show,
+    "compare": compare,
 }
 
 

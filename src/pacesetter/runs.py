@@ -115,13 +115,14 @@ class RunDirectory:
         except KeyError as error:
             raise UsageError(f"{self.config_file}: damaged: {error} is missing") from None
 
-    def rows(self) -> list[Row]:
-        """All complete lines of the log."""
+    def rows(self, *kinds: str) -> list[Row]:
+        """All complete lines of the log; of some kinds only, the others are not even parsed."""
         if not self.metrics_file.exists():
             return []
+        starts = tuple(f'{{"kind": "{kind}"' for kind in kinds) or ""
         try:
             lines = self.metrics_file.read_text().split("\n")[:-1]
-            return [json.loads(line) for line in lines]
+            return [json.loads(line) for line in lines if line.startswith(starts)]
         except ValueError as error:
             raise UsageError(f"{self.metrics_file}: damaged: {error}") from None
 

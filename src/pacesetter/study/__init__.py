@@ -1,0 +1,1 @@
+"""Many runs side by side: statistics, tables, curves and the report."""
