@@ -82,7 +82,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
-SLOW = ("normalized", "sac", "ou", "own-replays", "lap", "to-go")
+SLOW = ("normalized", "sac", "ou", "own-replays", "lap", "to-go", "assessed")
 
 
 @pytest.mark.parametrize(

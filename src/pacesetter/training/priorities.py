@@ -239,12 +239,16 @@ class ByReturn:
 
     def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
         count = int(np.prod(shape))
-        kept: list[Numbers] = []
-        while sum(map(len, kept)) < count:
+        found: Numbers = np.zeros(0, np.int64)
+        priorities: Reals = np.zeros(0)
+        while len(found) < count:
             numbers = window.start + rng.integers(len(window), size=2 * count)
-            kept.append(numbers[rng.random(2 * count) < self.priority(numbers)])
-        numbers = np.concatenate(kept)[:count].reshape(shape)
-        return Drawn(numbers, weigh(self.priority(numbers), self.importance, done))
+            priority = self.priority(numbers)
+            kept = rng.random(2 * count) < priority
+            found = np.concatenate([found, numbers[kept]])
+            priorities = np.concatenate([priorities, priority[kept]])
+        numbers, priority = (x[:count].reshape(shape) for x in (found, priorities))
+        return Drawn(numbers, weigh(priority, self.importance, done))
 
     def priority(self, numbers: Numbers) -> Reals:
         """Priorities of rows, as shares of the largest that there can be."""
