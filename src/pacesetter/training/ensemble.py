@@ -49,6 +49,7 @@ class Ensemble:
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps * config.unit
+        self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
         self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
         self.kept: list[Policy | None] = [None] * run.members  # the best assessed policies
@@ -177,19 +178,18 @@ class Ensemble:
         step = env.step(action)
         discount = hyper.gamma * (1.0 - step.terminated)
         mask = self.algorithm.mask(self.mask_streams[k])
-        self._store(
-            k,
-            Transition(
-                before,
-                action,
-                step.reward,
-                step.observation,
-                discount,
-                step.ended,
-                mask,
-                member.episode_return,
-            ),
+        transition = Transition(
+            before,
+            action,
+            step.reward,
+            step.observation,
+            discount,
+            step.ended,
+            mask,
+            earned=member.episode_return,
         )
+        for row in self.pending[k].push(transition):
+            self.replay(k).add(*row, member=k)
         if self.population.normalize:
             self.normalizer.add(before)
         member.step(step.reward)
@@ -197,10 +197,6 @@ class Ensemble:
             member.owed += hyper.updates_per_step
         if step.ended:
             self._end(k)
-
-    def _store(self, k: int, transition: Transition) -> None:
-        for row in self.pending[k].push(transition):
-            self.replay(k).add(*row, member=k)
 
     def _end(self, k: int) -> None:
         run, progress, member = self.config.run, self.progress, self.progress.members[k]
@@ -262,7 +258,9 @@ class Ensemble:
     def _cycle(self, k: int) -> tuple[Sample, Cycle]:
         progress, cycle = self.progress, self.algorithm.cycle
         member, shape = progress.members[k], (cycle, self.config.hyper.batch_size)
-        sample = self.replay(k).sample(self.sample_streams[k], shape, self._done())
+        sample = self.replay(k).sample(
+            self.sample_streams[k], shape, self._done() if self.horizon else 1.0
+        )
         result = self.population.update(
             self.states[k], k, member.cycles, sample.rows, sample.weight, self.statistics
         )
@@ -275,8 +273,7 @@ class Ensemble:
 
     def _done(self) -> float:
         """Share of the horizon that has passed, over which importance weights become whole."""
-        horizon = self.config.hyper.replay_horizon or self.config.run.steps
-        return min(self.progress.step / (horizon * self.config.unit), 1.0)
+        return min(self.progress.step / self.horizon, 1.0)
 
     def _check(self, k: int, losses: Floats) -> None:
         for name, loss in zip(self.loss_names, losses, strict=True):
@@ -290,7 +287,7 @@ class Ensemble:
         run, progress = self.config.run, self.progress
         ended = [member for member in progress.members if not member.active]
         over = len(ended) == run.members if run.wait else bool(ended)
-        if any(self._ready(k) for k, member in progress.each() if not member.active):
+        if over and any(self._ready(k) for k, member in progress.each() if not member.active):
             return None  # so many updates that they take several ticks
         selection = None
         if run.members > 1 and run.select_on == "eval":

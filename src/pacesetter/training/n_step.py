@@ -34,6 +34,8 @@ class Pending:
 
     def push(self, step: Transition) -> list[Transition]:
         """Take in a step; the rows that are complete with it, which at an episode's end are all."""
+        if self.steps == 1:
+            return [step]
         self.rows = [_extend(row, step) for row in self.rows] + [step]
         if step.last:
             return self.flush()
