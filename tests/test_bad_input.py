@@ -75,6 +75,38 @@ BAD_FLAGS: dict[str, tuple[list[str], list[str]]] = {
     "unknown env keyword": (["--env.wings", "2"], ["env", TASK, "wings"]),
     "env keyword without value": (["--env.gain"], ["--env.gain", "value"]),
     "env keyword without name": (["--env.", "3"], ["--env.", "KEY"]),
+    "unknown replay": (["--replay", "return-to-go"], ["replay", "return"]),
+    "exponent of a uniform replay": (
+        ["--replay-exponent", "0.6"],
+        ["replay_exponent", "prioritized", "uniform"],
+    ),
+    "weights in LAP": (
+        ["--replay", "lap", "--replay-importance", "0.4"],
+        ["replay_importance", "prioritized", "lap"],
+    ),
+    "to go of errors": (
+        ["--replay", "prioritized", "--replay-to-go"],
+        ["replay_to_go", "return", "prioritized"],
+    ),
+    "horizon without a replay for it": (["--replay-horizon", "5k"], ["replay_horizon", "uniform"]),
+    "horizon without weights": (
+        ["--replay", "return", "--replay-horizon", "5k"],
+        ["replay_horizon", "--replay-importance"],
+    ),
+    "horizon of weights that are off": (
+        ["--replay", "prioritized", "--replay-importance", "0", "--replay-horizon", "5k"],
+        ["replay_horizon", "--replay-importance"],
+    ),
+    "exponent beyond 2": (
+        ["--replay", "lap", "--replay-exponent", "3"],
+        ["replay_exponent", "less than or equal to 2", "3"],
+    ),
+    "no steps in a row": (["--n-step", "0"], ["n_step", "1", "0"]),
+    "more rows than a replay takes": (
+        ["--n-step", "100", "--members", "11"],
+        ["n_step", "100", "11", "1000"],
+    ),
+    "assessments that are off": (["--assess-after", "5k"], ["assess_after", "--assess"]),
     "config that is not there": (["--config", "no.toml"], ["config", "no.toml"]),
 }
 

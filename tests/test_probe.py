@@ -60,10 +60,13 @@ both = kinds("td3", "ddpg")
 every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter")
 
 
-def learn(kind: str, env: str, runs: Path, **kwargs: Any) -> Trainer:
+def learn(
+    kind: str, env: str, runs: Path, settings: dict[str, Any] | None = None, **kwargs: Any
+) -> Trainer:
     algorithm, more = KINDS[kind]
-    settings = {name: value for name, value in (LEARNS | more).items() if value is not None}
-    trainer = Trainer(algorithm, f"probe_envs:{env}", runs=runs, env_kwargs=kwargs, **settings)
+    options = LEARNS | more | (settings or {})
+    options = {name: value for name, value in options.items() if value is not None}
+    trainer = Trainer(algorithm, f"probe_envs:{env}", runs=runs, env_kwargs=kwargs, **options)
     run_to_end(trainer)
     return trainer
 
@@ -149,6 +152,39 @@ def test_a_fall_is_the_end_of_the_task(algorithm: str, runs: Path) -> None:
     trainer = learn(algorithm, "Corridor-v0", runs, falls_at=3)
     for seen, value in enumerate([1.75, 1.5, 1]):
         near(values(trainer, seen), value)
+
+
+# Other rows, drawn otherwise.
+
+KINDS: dict[str, dict[str, Any]] = {
+    "prioritized": {"replay": "prioritized"},
+    "lap": {"replay": "lap"},
+    "return": {"replay": "return"},
+    "to-go": {"replay": "return", "replay_to_go": True, "replay_importance": 0.4},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_replay_learns_the_same(kind: str, runs: Path) -> None:
+    """How rows are drawn moves no fixed point: reward -4 (a - s/2)^2 for s = -1 or 1."""
+    trainer = learn("td3", "BothReward-v0", runs, KINDS[kind])
+    near(trainer.policy()(np.array([[-1], [1]])), [[-0.5], [0.5]])
+    near(values(trainer, -1, [-0.5]), 0)
+    near(values(trainer, 1, [0.5]), 0)
+
+
+@pytest.mark.parametrize("n", [2, 3, 7])
+def test_rows_of_several_steps_up_to_a_fall(n: int, runs: Path) -> None:
+    """The same values as with one step, from rows that end at the fall or before it."""
+    trainer = learn("td3", "Corridor-v0", runs, {"n_step": n}, falls_at=3)
+    for seen, value in enumerate([1.75, 1.5, 1]):
+        near(values(trainer, seen), value)
+
+
+def test_rows_of_several_steps_up_to_a_cut(runs: Path) -> None:
+    """Rows of 3, 2 and 1 steps all bootstrap: reward 1 for ever is worth 2."""
+    trainer = learn("td3", "Corridor-v0", runs, {"n_step": 3}, blind=True, max_episode_steps=3)
+    near(values(trainer, 0), 2)
 
 
 # What the replay holds.

@@ -48,6 +48,40 @@ CASES = {
         "ucb": 0,
         "update_every": 50,
     },
+    "prioritized": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "replay": "prioritized",
+        "replay_size": 300,
+    },
+    "lap": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-sac",
+        "replay": "lap",
+        "n_step": 3,
+        "replay_scope": "member",
+    },
+    "return": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "replay": "return",
+        "replay_size": 300,
+        "n_step": 4,
+    },
+    "to-go": {
+        "env": "Hopper-v5",
+        "replay": "return",
+        "replay_to_go": True,
+        "replay_importance": 0.5,
+        "replay_size": 400,
+    },
+    "assessed": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "assess": 3,
+        "assess_after": 200,
+        "normalize_observation": True,
+    },
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
 }
 
@@ -71,16 +105,8 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
-SLOW = (
-    "normalized",
-    "sac",
-    "ou",
-    "own-replays",
-    "quantiles",
-    "crossq",
-    "sunrise",
-    "one-of-sunrise",
-)
+SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
+SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,19 @@
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+)
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
@@ -57,6 +64,39 @@ def only(value: float) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _only_with(*kinds: str) -> AfterValidator:
+    """A setting that only some kinds of replay use."""
+
+    def check(value: object, info: ValidationInfo) -> object:
+        kind = info.data.get("replay", kinds[0])
+        if value not in (None, False) and kind not in kinds:
+            raise ValueError(f"is a setting of --replay {' and '.join(kinds)}, not of {kind}")
+        return value
+
+    return AfterValidator(check)
+
+
+def _has_weights(value: object, info: ValidationInfo) -> object:
+    kind, given = info.data.get("replay"), info.data.get("replay_importance")
+    if value is not None and not (given or (given is None and REPLAYS.get(kind or "", (0, 1))[1])):
+        raise ValueError("is of importance weights, of which there are none; --replay-importance")
+    return value
+
+
+def _assessed(value: int | None, info: ValidationInfo) -> int | None:
+    if value is not None and not info.data.get("assess"):
+        raise ValueError("is a setting of --assess, which is off")
+    return value
+
+
+ROWS_A_TICK = 1_000  # that a replay takes, of all members together
+# The exponents of priorities and of importance weights that each kind of replay has by itself.
+REPLAYS = {
+    "uniform": (0.0, 0.0),
+    "prioritized": (0.6, 0.4),
+    "lap": (0.4, 0.0),
+    "return": (0.6, 0.0),
+}
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
 Duration = Annotated[float, BeforeValidator(_duration)]
@@ -76,7 +116,32 @@ class OffPolicy(Hyper):
 
     batch_size: int = Field(256, ge=1, description="transitions in a minibatch")
     replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
-    replay: Literal["uniform"] = Field("uniform", description="how minibatches are drawn")
+    replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
+        "uniform", description="rows are drawn alike, by TD error (PER; LAP) or by episode return"
+    )
+    replay_exponent: Annotated[float | None, _only_with("prioritized", "lap", "return")] = Field(
+        None, ge=0, le=2, description="power of priorities, 0 is uniform; none is 0.6, for lap 0.4"
+    )
+    replay_importance: Annotated[float | None, _only_with("prioritized", "return")] = Field(
+        None,
+        ge=0,
+        le=1,
+        description="power of importance weights at first, later 1; 0 is no weights; "
+        "none is 0.4, for return 0",
+    )
+    replay_horizon: Annotated[
+        Count | None, _only_with("prioritized", "return"), AfterValidator(_has_weights)
+    ] = Field(None, ge=1, description="steps until that power is 1; none is --steps at the start")
+    replay_to_go: Annotated[bool, _only_with("return")] = Field(
+        False, description="rank rows by what the episode still paid, not by all of it"
+    )
+    n_step: int = Field(1, ge=1, le=100, description="rewards summed before the target's value")
+    assess: int = Field(
+        0, ge=0, description="episodes that assess a policy before it learns on (TD7: 20); 0 is off"
+    )
+    assess_after: Annotated[Count | None, AfterValidator(_assessed)] = Field(
+        None, ge=0, description="a member's updates before which one assesses; none is 750000"
+    )
     warmup: Count = Field(25_000, ge=0, description="first steps of all members, uniform actions")
     warmup_updates: bool = Field(False, description="update during the warm-up too")
     updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
@@ -91,6 +156,16 @@ class OffPolicy(Hyper):
     def block(self) -> int:
         """Own env steps after which the updates that have fallen due are made."""
         return self.update_every or 1
+
+    @property
+    def exponents(self) -> tuple[float, float]:
+        """Of priorities and of importance weights, given or the replay's own."""
+        exponent, importance = REPLAYS[self.replay]
+        if self.replay_exponent is not None:
+            exponent = self.replay_exponent
+        if self.replay_importance is not None:
+            importance = self.replay_importance
+        return exponent, importance
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -200,6 +275,14 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             raise unknown("setting", key, run_names | hyper_names)
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
+    if isinstance(hyper, OffPolicy):
+        if hyper.n_step * run.members > ROWS_A_TICK:
+            raise UsageError(
+                f"n_step: {hyper.n_step} with {run.members} members; "
+                f"their product must be at most {ROWS_A_TICK}"
+            )
+        if hyper.exponents[1] and hyper.replay_horizon is None:
+            hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
     return Config(run, hyper)
 
 

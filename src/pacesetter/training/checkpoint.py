@@ -1,5 +1,6 @@
 """A whole run to a file and back, bit for bit: learners, replay, envs, random streams, counters."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,14 @@ import numpy as np
 from pacesetter import storage
 from pacesetter.envs import Snapshot
 from pacesetter.errors import TrainingError, UsageError
+from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, threads
 from pacesetter.storage import Arrays, Content
 from pacesetter.training.ensemble import Ensemble
 from pacesetter.training.progress import Progress
 
 KIND = "checkpoint"
-SCHEMA = 2
+SCHEMA = 3
 
 
 def save(ensemble: Ensemble, directory: RunDirectory) -> None:
@@ -34,12 +36,19 @@ def save(ensemble: Ensemble, directory: RunDirectory) -> None:
         episodes.append(snapshot.episode)
         arrays[f"env.{index}.actions"] = snapshot.actions
         arrays[f"env.{index}.observation"] = snapshot.observation
+    for index, pending in enumerate(ensemble.pending):
+        arrays |= _named(f"pending.{index}", pending.arrays())
+    for index, policy in enumerate(ensemble.kept):
+        arrays |= _flatten(f"kept.{index}", policy and _parts(policy))
+    for index, replay in enumerate(ensemble.replays):
+        arrays |= _named(f"replay.{index}", replay.arrays())
     table = {
         "schema": SCHEMA,
         "threads": threads(),
         "progress": ensemble.progress.table(),
         "streams": [rng.bit_generator.state for rng in ensemble.streams],
         "episodes": episodes,
+        "kept": [policy and policy.about for policy in ensemble.kept],
         "replays": [replay.commit() for replay in ensemble.replays],
         "log": directory.sync_log(),
         "run": _identity(ensemble),
@@ -80,8 +89,11 @@ def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: lis
     try:
         states = jax.tree.map(jax.numpy.array, _rebuild("states", ensemble.states, arrays))
         memory = _rebuild("memory", ensemble.memory, arrays)
-        for replay, part in zip(ensemble.replays, table["replays"], strict=True):
-            replay.restore(part)
+        kept = _kept(ensemble, table["kept"], arrays)
+        for index, pending in enumerate(ensemble.pending):
+            pending.restore(_below(f"pending.{index}", arrays))
+        for index, part in enumerate(table["replays"]):
+            ensemble.replays[index].restore(part, _below(f"replay.{index}", arrays))
         ensemble.progress = Progress.load(table["progress"])
         ensemble.normalizer.sums = arrays["normalizer"]
         for rng, state in zip(ensemble.streams, table["streams"], strict=True):
@@ -89,7 +101,7 @@ def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: lis
         _enter_episodes(ensemble, table["episodes"], arrays, notes)
     except storage.FAULTS as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
-    ensemble.states, ensemble.memory = states, memory
+    ensemble.states, ensemble.memory, ensemble.kept = states, memory, kept
     ensemble.acting = ensemble.population.acting(states)
     if not directory.cut_log(int(table["log"])):
         notes.append(f"{directory.metrics_file}: rows of the log are missing")
@@ -114,7 +126,32 @@ def _enter_episodes(
             notes.append(
                 f"member {index}: {env.name} does not repeat an episode exactly; a new one starts"
             )
-            member.starting, member.episode_return, member.episode_length = True, 0.0, 0
+            ensemble.abandon(index)
+
+
+def _kept(ensemble: Ensemble, abouts: list[Any], arrays: Arrays) -> list[Policy | None]:
+    kept: list[Policy | None] = []
+    for index, about in enumerate(abouts):
+        policy = None
+        if about is not None:
+            policy = ensemble.current(index)
+            actors, normalizer = _rebuild(f"kept.{index}", _parts(policy), arrays)
+            policy = replace(policy, actors=actors, normalizer=normalizer, about=about)
+        kept.append(policy)
+    return kept
+
+
+def _parts(policy: Policy) -> Any:
+    return policy.actors, policy.normalizer
+
+
+def _named(prefix: str, arrays: Arrays) -> Arrays:
+    return {f"{prefix}.{name}": array for name, array in arrays.items()}
+
+
+def _below(prefix: str, arrays: Arrays) -> Arrays:
+    start = f"{prefix}."
+    return {key.removeprefix(start): x for key, x in arrays.items() if key.startswith(start)}
 
 
 def _flatten(prefix: str, tree: Any) -> Arrays:

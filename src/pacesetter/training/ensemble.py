@@ -5,6 +5,7 @@ members that owe enough updates make them on their own batches  learn
 when the round is over, all start again from the rule's choice  turn
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,17 @@ from pacesetter.evaluation import rollouts
 from pacesetter.policy import Floats, Policy, clip, normalize, unstack
 from pacesetter.rules import Parents
 from pacesetter.seeding import Stream, generator
+from pacesetter.training import priorities
 from pacesetter.training import selection as selections
+from pacesetter.training.n_step import Pending, Transition
 from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Cycle, Population, inherit
 from pacesetter.training.progress import Member, Progress
 from pacesetter.training.replay import Columns, Replay, Sample
 from pacesetter.training.selection import Selection
+
+LONGEST = 500  # cycles a member and tick, so that a run can be stopped and saved between them
+ASSESS_AFTER = 750_000  # updates (TD7)
 
 
 class Ensemble:
@@ -43,7 +49,10 @@ class Ensemble:
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps * config.unit
+        self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
+        self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
+        self.kept: list[Policy | None] = [None] * run.members  # the best assessed policies
         self.warmup_streams = [generator(run.seed, Stream.WARMUP, k) for k in range(run.members)]
         self.act_streams = [generator(run.seed, Stream.ACT, k) for k in range(run.members)]
         self.sample_streams = [generator(run.seed, Stream.SAMPLE, k) for k in range(run.members)]
@@ -62,7 +71,8 @@ class Ensemble:
         size = self.config.hyper.replay_size
         for i in range(count):
             path = folder / f"replay-{i}.bin"
-            self.replays.append(Replay(path, self.columns, size, self.budget))
+            drawing = priorities.choose(self.config.hyper, min(size, self.budget))
+            self.replays.append(Replay(path, self.columns, size, self.budget, drawing))
 
     @property
     def streams(self) -> list[np.random.Generator]:
@@ -85,7 +95,7 @@ class Ensemble:
             self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
         first, left = progress.selections * run.select_window, self.budget - progress.step
         with blame(k, progress.step):
-            act = self.policy(k).act
+            act = self.current(k).act
             trial = rollouts(act, self.trial_env, run.select_window, first, limit=left)
         progress.selection_steps += sum(trial.lengths)
         return trial.returns
@@ -110,6 +120,11 @@ class Ensemble:
         return progress.ledger() | self.algorithm.ledger(progress.updates, actions)
 
     def policy(self, member: int) -> Policy:
+        """A member's policy: the best that was assessed, if any was, or as it is now."""
+        kept = self.kept[member]
+        return self.current(member) if kept is None else replace(kept, about=dict(kept.about))
+
+    def current(self, member: int) -> Policy:
         """A member's policy as it is now."""
         actors, env = self.algorithm.policy(self.states[member]), self.envs[0]
         statistics = self.statistics if self.population.normalize else None
@@ -138,6 +153,7 @@ class Ensemble:
         with blame(k, self.progress.step):
             self.envs[k].reset()
         member.start(self.progress.step)
+        member.assessment.over = False
         self.memory[k] = self.algorithm.begin(self.acting[k], self.act_streams[k])
 
     def _random(self, k: int) -> Floats:
@@ -162,33 +178,72 @@ class Ensemble:
         step = env.step(action)
         discount = hyper.gamma * (1.0 - step.terminated)
         mask = self.algorithm.mask(self.mask_streams[k])
-        self.replay(k).add(
-            before, action, step.reward, step.observation, discount, step.ended, mask
+        transition = Transition(
+            before,
+            action,
+            step.reward,
+            step.observation,
+            discount,
+            step.ended,
+            mask,
+            earned=member.episode_return,
         )
+        for row in self.pending[k].push(transition):
+            self.replay(k).add(*row, member=k)
         if self.population.normalize:
             self.normalizer.add(before)
         member.step(step.reward)
         if progress.step > hyper.warmup or hyper.warmup_updates:
             member.owed += hyper.updates_per_step
         if step.ended:
-            progress.episodes += 1
-            progress.ended.append([k, member.episode_return, member.episode_length])
-            selects = self.config.run.members > 1 and self.config.run.select_on == "train"
-            member.end(counts=selects and member.started >= hyper.warmup)
+            self._end(k)
+
+    def _end(self, k: int) -> None:
+        run, progress, member = self.config.run, self.progress, self.progress.members[k]
+        progress.episodes += 1
+        progress.ended.append([k, member.episode_return, member.episode_length])
+        self.replay(k).drawing.end(k, member.episode_return)
+        learned = member.started >= self.config.hyper.warmup
+        member.end(counts=learned and run.members > 1 and run.select_on == "train")
+        if self.config.hyper.assess and learned:
+            self._assess(k, member)
+
+    def _assess(self, k: int, member: Member) -> None:
+        """Whether a fixed policy is kept, dropped, or assessed further before it learns on."""
+        hyper, step = self.config.hyper, self.progress.step
+        after = ASSESS_AFTER if hyper.assess_after is None else hyper.assess_after
+        long = member.cycles * self.algorithm.cycle >= after
+        verdict = member.assessment.add(member.episode_return, long, hyper.assess)
+        if verdict is not None:
+            self.progress.assessed.append([k, verdict])
+        if verdict:
+            about = {"kept_at": step, "worst_return": member.assessment.best}
+            self.kept[k] = replace(self.current(k), about=about)
+
+    def abandon(self, k: int) -> None:
+        """Give up a running episode that cannot be entered again; its rows stay."""
+        for row in self.pending[k].flush():
+            self.replay(k).add(*row, member=k)
+        self.replay(k).drawing.end(k, None)
+        self.progress.members[k].abandon()
 
     # Learn.
 
     def learn(self) -> None:
         """Every member that owes a cycle of updates makes it, on its own minibatches."""
-        hyper, cycle = self.config.hyper, self.algorithm.cycle
-        at_end, block = hyper.update_at == "episode", hyper.block
-
-        def ready(member: Member) -> bool:
-            early = member.steps % block != 0 or (at_end and member.active)
-            return member.owed >= cycle and not early
-
-        while members := [k for k, member in self.progress.each() if ready(member)]:
+        for _ in range(LONGEST):
+            members = [k for k in range(self.config.run.members) if self._ready(k)]
+            if not members:
+                break
             self._update(members)
+
+    def _ready(self, k: int) -> bool:
+        hyper, member = self.config.hyper, self.progress.members[k]
+        if member.owed < self.algorithm.cycle or not len(self.replay(k)):
+            return False
+        if member.steps % hyper.block or (hyper.update_at == "episode" and member.active):
+            return False
+        return not hyper.assess or member.assessment.over
 
     def _update(self, members: list[int]) -> None:
         """All members' cycles are sent off before the first result is waited for."""
@@ -197,13 +252,15 @@ class Ensemble:
             losses = np.asarray(cycle.losses)
             self._check(k, losses)
             self.progress.note(losses)
-            self.replay(k).feedback(sample.slots, np.asarray(cycle.error))
+            self.replay(k).feedback(sample.numbers, np.asarray(cycle.error))
             self.acting[k] = jax.tree.map(np.asarray, cycle.acting)
 
     def _cycle(self, k: int) -> tuple[Sample, Cycle]:
         progress, cycle = self.progress, self.algorithm.cycle
         member, shape = progress.members[k], (cycle, self.config.hyper.batch_size)
-        sample = self.replay(k).sample(self.sample_streams[k], shape)
+        sample = self.replay(k).sample(
+            self.sample_streams[k], shape, self._done() if self.horizon else 1.0
+        )
         result = self.population.update(
             self.states[k], k, member.cycles, sample.rows, sample.weight, self.statistics
         )
@@ -213,6 +270,10 @@ class Ensemble:
         progress.updates += cycle
         progress.transitions += shape[0] * shape[1]
         return sample, result
+
+    def _done(self) -> float:
+        """Share of the horizon that has passed, over which importance weights become whole."""
+        return min(self.progress.step / self.horizon, 1.0)
 
     def _check(self, k: int, losses: Floats) -> None:
         for name, loss in zip(self.loss_names, losses, strict=True):
@@ -226,6 +287,8 @@ class Ensemble:
         run, progress = self.config.run, self.progress
         ended = [member for member in progress.members if not member.active]
         over = len(ended) == run.members if run.wait else bool(ended)
+        if over and any(self._ready(k) for k, member in progress.each() if not member.active):
+            return None  # so many updates that they take several ticks
         selection = None
         if run.members > 1 and run.select_on == "eval":
             selection = selections.on_trials(self)
@@ -237,9 +300,13 @@ class Ensemble:
         return selection
 
     def descend(self, parents: Parents) -> None:
-        """Every member starts again from its parent."""
+        """Every member starts again from its parent, and from what was found of its policy."""
         self.states = inherit(self.states, parents, self.config.run.copy)
         self.acting = self.population.acting(self.states)
+        self.kept = [self.kept[parent] for parent in parents]
+        assessments = [self.progress.members[parent].assessment.copy() for parent in parents]
+        for member, assessment in zip(self.progress.members, assessments, strict=True):
+            member.assessment = replace(assessment, over=member.assessment.over)
 
 
 class blame:  # noqa: N801 (a context manager reads as a verb)

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from pacesetter.training.assessment import Assessment
+
 TRAIN_ROW_EVERY = 1_000  # steps
 
 
@@ -22,6 +24,13 @@ class Member:
     episode_return: float = 0.0
     episode_length: int = 0
     window: list[float] = field(default_factory=list[float])  # returns since the last selection
+    assessment: Assessment = field(default_factory=Assessment)
+
+    @classmethod
+    def load(cls, table: dict[str, Any]) -> "Member":
+        """The inverse of `asdict`."""
+        assessment: Any = Assessment(**table["assessment"])
+        return cls(**(table | {"assessment": assessment}))
 
     def start(self, step: int) -> None:
         """Enter an episode at a step of the run."""
@@ -33,6 +42,10 @@ class Member:
         self.steps += 1
         self.episode_length += 1
         self.episode_return += reward
+
+    def abandon(self) -> None:
+        """Forget the episode and begin another."""
+        self.starting, self.episode_return, self.episode_length = True, 0.0, 0
 
     def end(self, counts: bool) -> None:
         """End the episode and wait; its return counts in a selection if it was no warm-up."""
@@ -60,6 +73,7 @@ class Progress:
     next_train: int = TRAIN_ROW_EVERY
     best: float | None = None
     ended: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
+    assessed: list[list[Any]] = field(default_factory=list[list[Any]])  # likewise
     losses: list[float] = field(default_factory=list[float])  # sums since the last row
     updated: int = 0  # how many losses were summed
     wall_seconds: float = 0.0
@@ -72,7 +86,7 @@ class Progress:
     @classmethod
     def load(cls, table: dict[str, Any]) -> "Progress":
         """The inverse of `asdict`."""
-        members: Any = [Member(**member) for member in table["members"]]
+        members: Any = [Member.load(member) for member in table["members"]]
         return cls(**(table | {"members": members}))
 
     @property
@@ -93,11 +107,15 @@ class Progress:
         self.updated += 1
 
     def training_values(self, loss_names: list[str]) -> dict[str, Any]:
-        """Episodes ended as [member, return, length] and mean losses since the last row."""
+        """Episodes ended as [member, return, length], policies assessed as [member, kept] if any
+        were, and mean losses, all since the last row.
+        """
         means = [total / self.updated for total in self.losses]
         values: dict[str, Any] = {"episodes_ended": self.ended}
         values |= dict(zip(loss_names, means, strict=False))  # no losses before the first update
-        self.ended, self.losses, self.updated = [], [], 0
+        if self.assessed:
+            values["assessed"] = self.assessed
+        self.ended, self.assessed, self.losses, self.updated = [], [], [], 0
         return values
 
     def ledger(self) -> dict[str, Any]:

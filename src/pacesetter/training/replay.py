@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from pacesetter.algorithm import Array, Batch
 from pacesetter.errors import UsageError
 from pacesetter.policy import Floats
-from pacesetter.storage import digest
+from pacesetter.storage import Arrays, digest
+from pacesetter.training.priorities import Drawing, Numbers, Uniform
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
-MEMBERS = 1_000  # at most, each of which may add a row before the next checkpoint
+MEMBERS = 1_000  # at most, each of which may add n_step rows before the next checkpoint
 SLACK = 2 * (UNCOMMITTED + MEMBERS) + BLOCK
 
 
@@ -54,18 +54,26 @@ class Columns(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Drawn rows (..., width), where they came from and their importance (None: all 1)."""
+    """Drawn rows (..., width), their numbers and their importance (None: all 1)."""
 
     rows: Floats
-    slots: NDArray[np.int64]
+    numbers: Numbers
     weight: Floats | None
 
 
 class Replay:
     """A ring of the last `capacity` transitions; row n of the run lies in slot n % slots."""
 
-    def __init__(self, path: Path, columns: Columns, capacity: int, budget: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        columns: Columns,
+        capacity: int,
+        budget: int,
+        drawing: Drawing | None = None,
+    ) -> None:
         self.path, self.columns, self.capacity = path, columns, capacity
+        self.drawing = drawing or Uniform()
         self.slots = capacity + SLACK
         self.head = 0  # rows added so far
         self.committed = 0  # rows that the latest checkpoint covers
@@ -77,6 +85,11 @@ class Replay:
 
     def __len__(self) -> int:
         return min(self.head, self.capacity)
+
+    @property
+    def window(self) -> range:
+        """The numbers of the rows that can be drawn."""
+        return range(self.head - len(self), self.head)
 
     @property
     def must_commit(self) -> bool:
@@ -92,8 +105,13 @@ class Replay:
         discount: float,
         last: bool,
         mask: Floats,
+        earned: float = 0.0,
+        member: int = 0,
     ) -> None:
-        """Store one transition; `following` is what step() returned, never a reset observation."""
+        """Store one transition; `following` is what step() returned, never a reset observation.
+
+        `earned` is what the member's episode had returned before it.
+        """
         row = self.rows[self.head % self.slots]
         size, middle = self.columns.observation, self.columns.observation + self.columns.action
         row[:size] = observation
@@ -103,16 +121,21 @@ class Replay:
         row[middle + 1 + size] = discount
         row[middle + 2 + size] = last
         row[middle + 3 + size :] = mask
+        self.drawing.add(self.head, member, earned)
         self.head += 1
 
-    def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Sample:
-        """Rows drawn uniformly with replacement from the window."""
-        size = len(self)
-        index = (self.head - size + rng.integers(size, size=shape)) % self.slots
-        return Sample(self.rows.take(index, axis=0), index, None)
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], done: float = 0.0) -> Sample:
+        """Rows drawn from the window; `done` is the share of the horizon that has passed."""
+        numbers, weight = self.drawing.draw(rng, shape, self.window, done)
+        return Sample(self.rows.take(numbers % self.slots, axis=0), numbers, weight)
 
-    def feedback(self, slots: NDArray[np.int64], error: Floats) -> None:
-        """What a prioritised replay learns from an update; a uniform one needs nothing."""
+    def feedback(self, numbers: Numbers, error: Floats) -> None:
+        """The errors that an update found in drawn rows, before any further row is added."""
+        self.drawing.feedback(numbers, error)
+
+    def arrays(self) -> Arrays:
+        """What a checkpoint must hold besides the rows."""
+        return self.drawing.arrays(self.window)
 
     def commit(self) -> dict[str, Any]:
         """Put all rows on disk; what a checkpoint must know to find and verify them again."""
@@ -128,7 +151,7 @@ class Replay:
         first = self._first_block()
         return {"head": self.head, "blocks": [first, *self.hashes[first:]], "tail": tail}
 
-    def restore(self, table: dict[str, Any]) -> None:
+    def restore(self, table: dict[str, Any], arrays: Arrays | None = None) -> None:
         """Take up the ring where a checkpoint left it, or refuse rows that are not its own."""
         self.head = self.committed = int(table["head"])
         first, *hashes = table["blocks"]
@@ -138,13 +161,14 @@ class Replay:
                 raise UsageError(f"{self.path}: damaged: rows from {block * BLOCK} on differ")
         if self._hash(self.head // BLOCK * BLOCK, self.head) != table["tail"]:
             raise UsageError(f"{self.path}: damaged: its newest rows differ")
+        self.drawing.restore(arrays or {}, self.window)
 
     def close(self) -> None:
         """Let go of the file, which is unmapped with its last user."""
         del self.rows, self._map
 
     def _first_block(self) -> int:
-        return (self.head - len(self)) // BLOCK
+        return self.window.start // BLOCK
 
     def _spans(self, start: int, stop: int) -> list[tuple[int, int]]:
         """The slots of rows start..stop, in one span or, around the end of the file, two."""
