@@ -74,6 +74,15 @@ class OffPolicy(Hyper):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class OnPolicy(Hyper):
+    """Settings of every algorithm that learns from the rollout just made, and then drops it."""
+
+    envs: int = Field(16, ge=1, le=1000, description="envs that a rollout is made in")
+    steps_per_update: Count = Field(1024, ge=1, description="steps of all envs in a rollout")
+    normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Run:
     """What to train: the task, the budget, the members and how the best one is chosen."""
 

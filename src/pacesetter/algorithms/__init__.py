@@ -19,6 +19,7 @@ TABLE = {
     "td3": Entry("pacesetter.algorithms.td3", "twin delayed DDPG (Fujimoto et al. 2018)"),
     "sac": Entry("pacesetter.algorithms.sac", "soft actor-critic, temperature learned"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
+    "trpo": Entry("pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy"),
 }
 
 
