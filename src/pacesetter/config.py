@@ -77,8 +77,8 @@ class OffPolicy(Hyper):
 class OnPolicy(Hyper):
     """Settings of every algorithm that learns from the rollout just made, and then drops it."""
 
-    envs: int = Field(16, ge=1, le=1000, description="envs that a rollout is made in")
-    steps_per_update: Count = Field(1024, ge=1, description="steps of all envs in a rollout")
+    envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
+    rollout_length: Count = Field(64, ge=1, description="steps of each env in a rollout")
     normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
 
 
@@ -117,6 +117,11 @@ class Run:
     eval_episodes: int = Field(10, ge=1, description="episodes of an evaluation")
     checkpoint_every: Duration = Field(60.0, gt=0, description="time between checkpoints")
     device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
+
+
+# What only members that share a replay need.
+OF_ENSEMBLES = {"members", "rule", "select_on", "select_every", "select_window", "copy"}
+OF_ENSEMBLES |= {"same_init", "count", "wait", "replay_scope"}
 
 
 class Config(NamedTuple):
@@ -189,7 +194,24 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             raise unknown("setting", key, run_names | hyper_names)
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
+    if isinstance(hyper, OnPolicy):
+        _refuse_ensemble(run)
     return Config(run, hyper)
+
+
+def _refuse_ensemble(run: Run) -> None:
+    for field in fields(Run):
+        value = getattr(run, field.name)
+        if field.name in OF_ENSEMBLES and value != (default := _default(field.name)):
+            raise UsageError(
+                f"{field.name}: {run.algorithm} trains one member, on rollouts of its own; "
+                f"must stay {default}, got {value}"
+            )
+
+
+def _default(name: str) -> Any:
+    infos: dict[str, Any] = Run.__dict__["__pydantic_fields__"]
+    return infos[name].default
 
 
 def names_of(kind: type) -> set[str]:

@@ -1,10 +1,10 @@
 """TRPO (Schulman et al. 2015) with generalised advantages (Schulman et al. 2016), one member.
 
-    delta = r + discount * V(s') - V(s);  A_t = sum over l of (gamma * lambda)^l delta_{t+l}
-    g = gradient of mean(ratio * A);  x = (F + damping)^-1 g by conjugate gradients
-    move the actor by c^j sqrt(2 max_kl / x'(F + damping)x) x, for the first of j = 0, 1, ... at
-        which mean(ratio * A) is higher and KL(old || new) <= max_kl; if there is none, not at all
-    fit V to V + A
+delta = r + discount * V(s') - V(s);  A_t = sum over l of (gamma * lambda)^l delta_{t+l}
+g = gradient of mean(ratio * A);  x = (F + damping)^-1 g by conjugate gradients
+move the actor by c^j sqrt(2 max_kl / x'(F + damping)x) x, for the first of j = 0, 1, ... at
+    which mean(ratio * A) is higher and KL(old || new) <= max_kl; if there is none, not at all
+fit V to V + A
 """
 
 from collections.abc import Callable
@@ -112,6 +112,12 @@ class TRPO:
         state, critic_loss = self.fit_critic(state, observation, targets, key)
         state = state._replace(actor=actor, updates=state.updates + 1)
         return Update(state, {"critic_loss": critic_loss, **losses}, jnp.abs(advantage))
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        hyper = self.hyper
+        rows = hyper.envs * hyper.rollout_length
+        minibatches = rows // min(hyper.critic_batch_size, rows)
+        return {"critic_updates": updates * hyper.critic_epochs * minibatches}
 
     def policy(self, state: State) -> Actors:
         """The deterministic action is the mean."""
