@@ -28,7 +28,7 @@ from pacesetter.policy import Actors, Floats, forward
 
 @settings(frozen=True, kw_only=True, config=STRICT)
 class Hyper(OnPolicy):
-    """Defaults are Tianshou's and RL Zoo's for MuJoCo, but for what docs/algorithms/trpo.md says."""
+    """Defaults are between those of Tianshou and RL Zoo for MuJoCo; see docs/algorithms/trpo.md."""
 
     hidden: tuple[Width, ...] = Field((64, 64), min_length=1, description="widths of hidden layers")
     initial_std: float = Field(0.6, gt=0, description="deviation of actions at the start")
