@@ -120,8 +120,8 @@ class Run:
 
 
 # What only members that share a replay need.
-OF_ENSEMBLES = {"members", "rule", "select_on", "select_every", "select_window", "copy"}
-OF_ENSEMBLES |= {"same_init", "count", "wait", "replay_scope"}
+OF_MEMBERS = ("members", "rule", "select_on", "select_every", "select_window", "copy", "same_init")
+OF_ENSEMBLES = (*OF_MEMBERS, "count", "wait", "replay_scope")
 
 
 class Config(NamedTuple):
@@ -158,7 +158,7 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
         base, layers = preset_layers(name.removeprefix("multi-"), env)
         return base, [*layers, {"members": 2, "rule": "best"}]
     if name not in algorithms.names() and ":" not in name:
-        multi = [f"multi-{base}" for base in algorithms.names()]
+        multi = [f"multi-{base}" for base in algorithms.names() if not algorithms.alone(base)]
         raise unknown("algorithm", name, {*algorithms.names(), *known, *multi})
     return name, []
 

@@ -13,13 +13,16 @@ class Entry(NamedTuple):
 
     target: str
     help: str
+    alone: bool = False  # it trains one member only
 
 
 TABLE = {
     "td3": Entry("pacesetter.algorithms.td3", "twin delayed DDPG (Fujimoto et al. 2018)"),
     "sac": Entry("pacesetter.algorithms.sac", "soft actor-critic, temperature learned"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
-    "trpo": Entry("pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy"),
+    "trpo": Entry(
+        "pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy", True
+    ),
 }
 
 
@@ -38,6 +41,11 @@ def plugins() -> dict[str, str]:
 def names() -> list[str]:
     """All names that `find` knows."""
     return [*TABLE, *plugins()]
+
+
+def alone(name: str) -> bool:
+    """Whether there is no `multi-` form of an algorithm."""
+    return name in TABLE and TABLE[name].alone
 
 
 def find(name: str) -> Kind:

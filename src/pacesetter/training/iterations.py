@@ -94,7 +94,7 @@ class Iterations:
         statistics = self.statistics
         for i in range(steps):
             k = i % len(self.envs)
-            with blame(k, self.progress.step):
+            with blame(k, self.progress.step, "env"):
                 rows[i] = self._step(k, statistics)
         return rows
 
@@ -143,7 +143,5 @@ class Iterations:
         progress.updates += 1
         progress.transitions += rows.shape[0] * rows.shape[1]
         if self.population.normalize:
-            for observation in rows[..., : self.columns.observation].reshape(
-                -1, self.columns.observation
-            ):
-                self.normalizer.add(observation)
+            for row in rows.reshape(-1, self.columns.width):
+                self.normalizer.add(row[: self.columns.observation])
