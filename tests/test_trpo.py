@@ -126,7 +126,7 @@ def test_updates_stay_in_the_trust_region(updated: Any) -> None:
         divergence = float(trpo.kl(old, new))
         np.testing.assert_allclose(divergence, update.losses["kl"], rtol=1e-3, atol=1e-7)
         assert update.losses["accepted"] == 1
-        assert 0 < divergence <= 0.01 + 1e-6
+        assert 0 < divergence <= 0.02 + 1e-6
         assert update.losses["surrogate"] > 0
     first, last = updated[0][0].actor, updated[-1][2].state.actor
     observation = jnp.zeros((1, 3))

@@ -28,13 +28,13 @@ from pacesetter.policy import Actors, Floats, forward
 
 @settings(frozen=True, kw_only=True, config=STRICT)
 class Hyper(OnPolicy):
-    """Defaults are between those of Tianshou and RL Zoo for MuJoCo; see docs/algorithms/trpo.md."""
+    """Tianshou's for MuJoCo, but for longer steps, less damping and minibatches of the critic."""
 
     hidden: tuple[Width, ...] = Field((64, 64), min_length=1, description="widths of hidden layers")
     initial_std: float = Field(0.6, gt=0, description="deviation of actions at the start")
     gae_lambda: float = Field(0.95, ge=0, le=1, description="decay of later errors in advantages")
-    max_kl: float = Field(0.01, gt=0, description="bound of the mean KL of one update, in nats")
-    damping: float = Field(0.1, ge=0, description="added to the Fisher matrix's diagonal")
+    max_kl: float = Field(0.02, gt=0, description="bound of the mean KL of one update, in nats")
+    damping: float = Field(0.01, ge=0, description="added to the Fisher matrix's diagonal")
     gradient_steps: int = Field(10, ge=1, description="conjugate gradient steps an update")
     backtracks: int = Field(10, ge=1, description="lengths that the line search tries")
     backtrack_ratio: float = Field(0.8, gt=0, lt=1, description="each length by the one before")
