@@ -169,6 +169,15 @@ class OffPolicy(Hyper):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class OnPolicy(Hyper):
+    """Settings of every algorithm that learns from the rollout just made, and then drops it."""
+
+    envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
+    rollout_length: Count = Field(64, ge=1, description="steps of each env in a rollout")
+    normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Run:
     """What to train: the task, the budget, the members and how the best one is chosen."""
 
@@ -205,6 +214,11 @@ class Run:
     device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
 
 
+# What only members that share a replay need.
+OF_MEMBERS = ("members", "rule", "select_on", "select_every", "select_window", "copy", "same_init")
+OF_ENSEMBLES = (*OF_MEMBERS, "count", "wait", "replay_scope")
+
+
 class Config(NamedTuple):
     """A whole run: what to train and with which settings."""
 
@@ -239,7 +253,7 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
         base, layers = preset_layers(name.removeprefix("multi-"), env)
         return base, [*layers, {"members": 2, "rule": "best"}]
     if name not in algorithms.names() and ":" not in name:
-        multi = [f"multi-{base}" for base in algorithms.names()]
+        multi = [f"multi-{base}" for base in algorithms.names() if not algorithms.alone(base)]
         raise unknown("algorithm", name, {*algorithms.names(), *known, *multi})
     return name, []
 
@@ -283,7 +297,24 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             )
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
+    if isinstance(hyper, OnPolicy):
+        _refuse_ensemble(run)
     return Config(run, hyper)
+
+
+def _refuse_ensemble(run: Run) -> None:
+    for field in fields(Run):
+        value = getattr(run, field.name)
+        if field.name in OF_ENSEMBLES and value != (default := _default(field.name)):
+            raise UsageError(
+                f"{field.name}: {run.algorithm} trains one member, on rollouts of its own; "
+                f"must stay {default}, got {value}"
+            )
+
+
+def _default(name: str) -> Any:
+    infos: dict[str, Any] = Run.__dict__["__pydantic_fields__"]
+    return infos[name].default
 
 
 def names_of(kind: type) -> set[str]:

@@ -13,10 +13,11 @@ SHOWN_EVALUATIONS = 5
 
 def algorithms() -> list[str]:
     """Algorithms and what each is, with the ensemble form of each."""
-    from pacesetter.algorithms import TABLE, plugins
+    from pacesetter.algorithms import TABLE, alone, plugins
 
     rows = [(name, entry.help) for name, entry in TABLE.items()]
-    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in TABLE]
+    several = [name for name in TABLE if not alone(name)]
+    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
     rows += [(name, target) for name, target in plugins().items()]
     return _table(rows)
 

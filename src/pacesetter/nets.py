@@ -48,6 +48,21 @@ def init(
     return tuple(layers)
 
 
+def orthogonal(
+    key: Array, inputs: int, hidden: Sequence[int], outputs: int, output_gain: float
+) -> Network:
+    """A new network for tanh units: orthogonal kernels of gain sqrt(2), no bias (Andrychowicz et
+    al. 2021)."""
+    sizes = [inputs, *hidden, outputs]
+    gains = [2**0.5] * len(hidden) + [output_gain]
+    layers: list[Layer] = []
+    for index, layer_key in enumerate(jax.random.split(key, len(gains))):
+        kernel = jax.nn.initializers.orthogonal(gains[index])
+        shape = (sizes[index], sizes[index + 1])
+        layers.append({"kernel": kernel(layer_key, shape), "bias": jnp.zeros(shape[1])})
+    return tuple(layers)
+
+
 def hidden_layer(layer: Layer, x: Array, activation: Callable[[Array], Array]) -> Array:
     """One hidden layer: affine, layer norm if it has one, activation."""
     x = x @ layer["kernel"] + layer["bias"]

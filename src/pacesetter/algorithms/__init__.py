@@ -13,6 +13,7 @@ class Entry(NamedTuple):
 
     target: str
     help: str
+    alone: bool = False  # it trains one member only
 
 
 TABLE = {
@@ -26,6 +27,9 @@ TABLE = {
     ),
     "sunrise-td3": Entry("pacesetter.algorithms.sunrise_td3", "SUNRISE's ensemble over TD3"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
+    "trpo": Entry(
+        "pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy", True
+    ),
 }
 
 
@@ -44,6 +48,11 @@ def plugins() -> dict[str, str]:
 def names() -> list[str]:
     """All names that `find` knows."""
     return [*TABLE, *plugins()]
+
+
+def alone(name: str) -> bool:
+    """Whether there is no `multi-` form of an algorithm."""
+    return name in TABLE and TABLE[name].alone
 
 
 def find(name: str) -> Kind:

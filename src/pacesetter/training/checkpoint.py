@@ -14,13 +14,16 @@ from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, threads
 from pacesetter.storage import Arrays, Content
 from pacesetter.training.ensemble import Ensemble
+from pacesetter.training.iterations import Iterations
 from pacesetter.training.progress import Progress
 
 KIND = "checkpoint"
 SCHEMA = 3
 
+Learning = Ensemble | Iterations
 
-def save(ensemble: Ensemble, directory: RunDirectory) -> None:
+
+def save(ensemble: Learning, directory: RunDirectory) -> None:
     """Write the checkpoint; the one before it stays as previous.safetensors."""
     arrays = {
         **_flatten("states", ensemble.states),
@@ -56,7 +59,7 @@ def save(ensemble: Ensemble, directory: RunDirectory) -> None:
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
 
 
-def restore(ensemble: Ensemble, directory: RunDirectory) -> list[str]:
+def restore(ensemble: Learning, directory: RunDirectory) -> list[str]:
     """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
     notes: list[str] = []
     files = [directory.state_file, directory.previous_file]
@@ -78,7 +81,7 @@ def restore(ensemble: Ensemble, directory: RunDirectory) -> list[str]:
     return ["no checkpoint yet, starting from the beginning"]
 
 
-def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: list[str]) -> None:
+def _restore(ensemble: Learning, directory: RunDirectory, file: Path, notes: list[str]) -> None:
     arrays, table = storage.read(file, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
@@ -113,7 +116,7 @@ def _restore(ensemble: Ensemble, directory: RunDirectory, file: Path, notes: lis
 
 
 def _enter_episodes(
-    ensemble: Ensemble, episodes: list[int], arrays: Arrays, notes: list[str]
+    ensemble: Learning, episodes: list[int], arrays: Arrays, notes: list[str]
 ) -> None:
     for index, (env, episode) in enumerate(zip(ensemble.envs, episodes, strict=True)):
         actions, observation = (
@@ -174,7 +177,7 @@ def _name(prefix: str, path: Any) -> str:
     return f"{prefix}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
 
 
-def _identity(ensemble: Ensemble) -> dict[str, Any]:
+def _identity(ensemble: Learning) -> dict[str, Any]:
     run = ensemble.config.run
     names = ("algorithm", "env", "env_kwargs", "seed", "members")
     return {name: getattr(run, name) for name in names}

@@ -310,10 +310,10 @@ class Ensemble:
 
 
 class blame:  # noqa: N801 (a context manager reads as a verb)
-    """Name member and step in whatever an env does wrong."""
+    """Name member (or env) and step in whatever an env does wrong."""
 
-    def __init__(self, member: int, step: int) -> None:
-        self.where = f"member {member}, step {step}"
+    def __init__(self, number: int, step: int, who: str = "member") -> None:
+        self.where = f"{who} {number}, step {step}"
 
     def __enter__(self) -> None:
         return None

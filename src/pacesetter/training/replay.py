@@ -35,6 +35,21 @@ class Columns(NamedTuple):
     def width(self) -> int:
         return 2 * self.observation + self.action + 3 + self.masks
 
+    def pack(
+        self,
+        observation: Floats,
+        action: Floats,
+        reward: float,
+        following: Floats,
+        discount: float,
+        last: bool,
+        mask: Floats,
+    ) -> Floats:
+        """The row (width,) of a transition; `following` is what step() returned, never a reset
+        observation."""
+        parts = (observation, action, [reward], following, [discount, last], mask)
+        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+
     def unpack(self, rows: Array, weight: Array | None) -> Batch:
         """Rows (..., width) as a batch; without weights all count 1."""
         ends = np.cumsum([self.observation, self.action, 1, self.observation, 1, 1])
@@ -112,15 +127,8 @@ class Replay:
 
         `earned` is what the member's episode had returned before it.
         """
-        row = self.rows[self.head % self.slots]
-        size, middle = self.columns.observation, self.columns.observation + self.columns.action
-        row[:size] = observation
-        row[size:middle] = action
-        row[middle] = reward
-        row[middle + 1 : middle + 1 + size] = following
-        row[middle + 1 + size] = discount
-        row[middle + 2 + size] = last
-        row[middle + 3 + size :] = mask
+        row = self.columns.pack(observation, action, reward, following, discount, last, mask)
+        self.rows[self.head % self.slots] = row
         self.drawing.add(self.head, member, earned)
         self.head += 1
 

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import jax
 
-from pacesetter.config import read_file, settle
+from pacesetter.config import OnPolicy, read_file, settle
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.evaluation import Evaluation, rollouts
@@ -17,6 +17,7 @@ from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
 from pacesetter.training import checkpoint
 from pacesetter.training.ensemble import Ensemble, blame
+from pacesetter.training.iterations import Iterations
 from pacesetter.training.progress import TRAIN_ROW_EVERY, Clock, Progress
 
 
@@ -102,12 +103,14 @@ class Trainer:
 
     def _begin(self) -> None:
         run = self.config.run
+        hyper = self.config.hyper
+        on_policy = isinstance(hyper, OnPolicy)
         envs = [
-            Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, member)
-            for member in range(run.members)
+            Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
+            for index in range(hyper.envs if on_policy else run.members)
         ]
         envs[0].check()
-        self.ensemble = Ensemble(self.config, envs)
+        self.ensemble = (Iterations if on_policy else Ensemble)(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []
         self._stopping = self._closed = False

@@ -1,0 +1,323 @@
+"""TRPO (Schulman et al. 2015) with generalised advantages (Schulman et al. 2016), one member.
+
+delta = r + discount * V(s') - V(s);  A_t = sum over l of (gamma * lambda)^l delta_{t+l}
+g = gradient of mean(ratio * A);  x = (F + damping)^-1 g by conjugate gradients
+move the actor by c^j sqrt(2 max_kl / x'(F + damping)x) x, for the first of j = 0, 1, ... at
+    which mean(ratio * A) is higher and KL(old || new) <= max_kl; if there is none, not at all
+fit V to V + A
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
+from jax.scipy.sparse.linalg import cg
+from pydantic import Field
+from pydantic.dataclasses import dataclass as settings
+
+from pacesetter import nets
+from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.config import STRICT, OnPolicy, Width
+from pacesetter.policy import Actors, Floats, forward
+
+
+@settings(frozen=True, kw_only=True, config=STRICT)
+class Hyper(OnPolicy):
+    """Tianshou's for MuJoCo, but for longer steps, less damping and minibatches of the critic."""
+
+    hidden: tuple[Width, ...] = Field((64, 64), min_length=1, description="widths of hidden layers")
+    initial_std: float = Field(0.6, gt=0, description="deviation of actions at the start")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="decay of later errors in advantages")
+    max_kl: float = Field(0.02, gt=0, description="bound of the mean KL of one update, in nats")
+    damping: float = Field(0.01, ge=0, description="added to the Fisher matrix's diagonal")
+    gradient_steps: int = Field(10, ge=1, description="conjugate gradient steps an update")
+    backtracks: int = Field(10, ge=1, description="lengths that the line search tries")
+    backtrack_ratio: float = Field(0.8, gt=0, lt=1, description="each length by the one before")
+    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critic")
+    critic_epochs: int = Field(20, ge=0, description="passes of the critic over a rollout")
+    critic_batch_size: int = Field(128, ge=1, description="observations in its minibatches")
+
+
+class Gaussian(NamedTuple):
+    """A policy: a tanh network of the mean (A,), and a log deviation (A,) that sees nothing."""
+
+    network: nets.Network
+    log_std: Array
+
+
+class State(NamedTuple):
+    """One learner; the critic's output is in units of the deviation of all returns so far."""
+
+    actor: Gaussian
+    critic: nets.Network
+    critic_optimizer: Any
+    returns: Array  # (3,): count, mean and squared deviations of the critic's targets so far
+    updates: Array
+
+
+@dataclass(frozen=True)
+class TRPO:
+    """The learner of one member."""
+
+    spec: Spec
+    hyper: Hyper
+    cycle: int = 1
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        return NO_MASK
+
+    def init(self, key: Array) -> State:
+        actor_key, critic_key = jax.random.split(key)
+        (observation, action), hidden = self.spec, self.hyper.hidden
+        critic = nets.orthogonal(critic_key, observation, hidden, 1, output_gain=1.0)
+        return State(
+            actor=Gaussian(
+                nets.orthogonal(actor_key, observation, hidden, action, output_gain=0.01),
+                jnp.full(action, np.log(self.hyper.initial_std), jnp.float32),
+            ),
+            critic=critic,
+            critic_optimizer=self._adam.init(critic),
+            returns=jnp.zeros(3),
+            updates=jnp.zeros((), jnp.int32),
+        )
+
+    def acting(self, state: State) -> Gaussian:
+        return state.actor
+
+    def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
+        return ()
+
+    def act(
+        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        mean = forward(acting.network, observation, np.tanh)
+        return mean + np.exp(acting.log_std) * rng.standard_normal(len(mean), np.float32), memory
+
+    def update(self, state: State, batch: Batch, key: Array) -> Update:
+        """One iteration on a rollout (T, E, ...)."""
+        values = self.values(state, batch.observation)
+        advantage = advantages(
+            batch, values, self.values(state, batch.next_observation), self.hyper.gae_lambda
+        )
+        flat: Callable[[Array], Array] = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+        observation, targets = flat(batch.observation), flat(values + advantage)
+        actor, losses = self.fit_actor(
+            state.actor, observation, flat(batch.action), standardize(flat(advantage))
+        )
+        state, critic_loss = self.fit_critic(state, observation, targets, key)
+        state = state._replace(actor=actor, updates=state.updates + 1)
+        return Update(state, {"critic_loss": critic_loss, **losses}, jnp.abs(advantage))
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        hyper = self.hyper
+        rows = hyper.envs * hyper.rollout_length
+        minibatches = rows // min(hyper.critic_batch_size, rows)
+        return {"critic_updates": updates * hyper.critic_epochs * minibatches}
+
+    def policy(self, state: State) -> Actors:
+        """The deterministic action is the mean."""
+        one = jax.tree.map(lambda x: x[None], state.actor.network)
+        return Actors(one, activation="tanh", output="clip")
+
+    # The pieces that `update` composes.
+
+    def values(self, state: State, observation: Array) -> Array:
+        """V (...) of observations (..., O), in units of reward."""
+        scaled = nets.apply(state.critic, observation, jnp.tanh)[..., 0]
+        return scaled * deviation(state.returns)
+
+    def fit_actor(
+        self, actor: Gaussian, observation: Array, action: Array, advantage: Array
+    ) -> tuple[Gaussian, dict[str, Array]]:
+        """One natural gradient step within the trust region, from a batch (B, ...)."""
+        hyper = self.hyper
+        parameters, unravel = ravel_pytree(actor)
+
+        def distribution(parameters: Array) -> Moments:
+            return moments(unravel(parameters), observation)
+
+        old = distribution(parameters)
+        old_log_prob = log_probability(old, action)
+
+        def surrogate(parameters: Array) -> Array:
+            log_prob = log_probability(distribution(parameters), action)
+            return (jnp.exp(log_prob - old_log_prob) * advantage).mean()
+
+        before, gradient = jax.value_and_grad(surrogate)(parameters)
+        fisher = fisher_product(distribution, parameters)
+
+        def damped(vector: Array) -> Array:
+            return fisher(vector) + hyper.damping * vector
+
+        direction, _ = cg(damped, gradient, tol=1e-6, maxiter=hyper.gradient_steps)
+        # Without a gradient there is no direction, and no 0 / 0 either.
+        curvature = jnp.maximum(direction @ damped(direction), jnp.finfo(jnp.float32).tiny)
+        full = jnp.sqrt(2 * hyper.max_kl / curvature) * direction
+
+        def judge(candidate: Array) -> tuple[Array, Array]:
+            divergence = kl(old, distribution(candidate))
+            gain = surrogate(candidate) - before
+            return (gain > 0) & (divergence <= hyper.max_kl), jnp.stack([divergence, gain])
+
+        moved, accepted, (divergence, gain) = line_search(
+            judge, parameters, full, hyper.backtrack_ratio, hyper.backtracks
+        )
+        losses = {
+            "kl": divergence,
+            "surrogate": gain,
+            "accepted": accepted.astype(jnp.float32),
+            "std": jnp.exp(actor.log_std).mean(),
+        }
+        return unravel(moved), losses
+
+    def fit_critic(
+        self, state: State, observation: Array, targets: Array, key: Array
+    ) -> tuple[State, Array]:
+        """Adam on minibatches (B,) of squared errors; the targets first join the scale."""
+        size = min(self.hyper.critic_batch_size, len(targets))
+        returns = add_moments(state.returns, targets)
+        scaled = targets / deviation(returns)
+
+        def loss(critic: nets.Network, rows: Array) -> Array:
+            values = nets.apply(critic, observation[rows], jnp.tanh)[..., 0]
+            return ((values - scaled[rows]) ** 2).mean()
+
+        def step(carry: Any, rows: Array) -> tuple[Any, Array]:
+            value, gradient = jax.value_and_grad(loss)(carry[0], rows)
+            return nets.descend(self._adam, carry[0], gradient, carry[1]), value
+
+        def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
+            order = jax.random.permutation(key, len(targets))
+            whole = len(targets) // size * size  # the few rows left over differ at every pass
+            return jax.lax.scan(step, carry, order[:whole].reshape(-1, size))
+
+        carry = (state.critic, state.critic_optimizer)
+        (critic, optimizer), _ = jax.lax.scan(
+            epoch, carry, jax.random.split(key, self.hyper.critic_epochs)
+        )
+        state = state._replace(critic=critic, critic_optimizer=optimizer, returns=returns)
+        return state, loss(critic, jnp.arange(len(targets)))
+
+    @property
+    def _adam(self) -> optax.GradientTransformation:
+        return optax.adam(self.hyper.critic_learning_rate)
+
+
+build = TRPO
+
+
+def advantages(batch: Batch, values: Array, next_values: Array, decay: float) -> Array:
+    """Generalised advantages (T, E) of a rollout from the values of its ends (both (T, E)).
+
+    The value of what follows counts wherever the task goes on: after a time limit, and where the
+    rollout is cut; errors of one episode never reach another.
+    """
+    delta = batch.reward + batch.discount * next_values - values
+
+    def step(following: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+        error, share = inputs
+        advantage = error + share * following
+        return advantage, advantage
+
+    share = decay * batch.discount * (1 - batch.last)
+    return jax.lax.scan(step, jnp.zeros_like(delta[0]), (delta, share), reverse=True)[1]
+
+
+# A diagonal Gaussian: its mean (B, A) and log deviation (A,).
+Moments = tuple[Array, Array]
+
+
+def moments(actor: Gaussian, observation: Array) -> Moments:
+    return nets.apply(actor.network, observation, jnp.tanh), actor.log_std
+
+
+def log_probability(moments: Moments, action: Array) -> Array:
+    """log pi (B,) of actions (B, A), which are not cut."""
+    mean, log_std = moments
+    distance = (action - mean) * jnp.exp(-log_std)
+    return -(0.5 * distance**2 + log_std + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=-1)
+
+
+def kl(old: Moments, new: Moments) -> Array:
+    """Mean over B of KL(old || new)."""
+    (old_mean, old_log_std), (mean, log_std) = old, new
+    squares = jnp.exp(2 * old_log_std) + (old_mean - mean) ** 2
+    each = log_std - old_log_std + 0.5 * squares * jnp.exp(-2 * log_std) - 0.5
+    return each.sum(axis=-1).mean()
+
+
+def fisher_product(
+    distribution: Callable[[Array], Moments], parameters: Array
+) -> Callable[[Array], Array]:
+    """v -> Fv, where F is the Hessian of the mean KL from `parameters` to themselves.
+
+    F = J'MJ exactly, with J the Jacobian of mean and log deviation, and M the Fisher matrix of a
+    Gaussian in those, which is diagonal: 1 / std^2 and 2.
+    """
+    (mean, log_std), jacobian = jax.linearize(distribution, parameters)
+    transposed = jax.linear_transpose(jacobian, parameters)
+
+    def product(vector: Array) -> Array:
+        mean_change, log_std_change = jacobian(vector)
+        weighted = mean_change * jnp.exp(-2 * log_std) / len(mean)
+        return transposed((weighted, 2 * log_std_change))[0]
+
+    return product
+
+
+def line_search(
+    judge: Callable[[Array], tuple[Array, Array]],
+    start: Array,
+    step: Array,
+    ratio: float,
+    tries: int,
+) -> tuple[Array, Array, Array]:
+    """The first of start + ratio^j * step that `judge` takes, whether any was, and its measures.
+
+    If none of j < tries is taken: start, False and zeros.
+    """
+
+    def goes_on(carry: Any) -> Array:
+        j, _, accepted, _ = carry
+        return ~accepted & (j < tries)
+
+    def attempt(carry: Any) -> Any:
+        j, *_ = carry
+        candidate = start + ratio**j * step
+        return j + 1, candidate, *judge(candidate)
+
+    _, measures = jax.eval_shape(judge, start)
+    nothing = jnp.zeros(measures.shape, measures.dtype)
+    begin = (jnp.zeros((), jnp.int32), start, jnp.array(False), nothing)
+    _, candidate, accepted, measures = jax.lax.while_loop(goes_on, attempt, begin)
+    return (
+        jnp.where(accepted, candidate, start),
+        accepted,
+        jnp.where(accepted, measures, nothing),
+    )
+
+
+def standardize(x: Array) -> Array:
+    """Mean 0 and deviation 1; equal numbers become 0."""
+    return (x - x.mean()) / (x.std() + 1e-8)
+
+
+def add_moments(sums: Array, values: Array) -> Array:
+    """Count, mean and squared deviations (3,) with more values (B,) (Chan et al. 1979)."""
+    count, mean, squares = sums
+    added, total = len(values), count + len(values)
+    change = values.mean() - mean
+    squares += values.var() * added + change**2 * count * added / total
+    return jnp.stack([total, mean + change * added / total, squares])
+
+
+def deviation(sums: Array) -> Array:
+    """Of what the sums have seen; 1 before anything was seen or if all of it was equal."""
+    count, _, squares = sums
+    variance = squares / jnp.maximum(count, 1)
+    return jnp.where(variance > 1e-8, jnp.sqrt(jnp.maximum(variance, 1e-8)), 1.0)

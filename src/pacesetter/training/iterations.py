@@ -1,0 +1,147 @@
+"""On-policy learning: one tick is one iteration, a rollout and one update from it.
+
+all envs are stepped in turn, with one policy and frozen statistics     collect
+one update from the whole rollout, then its observations join them      learn
+
+A checkpoint falls between iterations, so it holds no rollout: only running episodes.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pacesetter import algorithms
+from pacesetter.algorithm import Algorithm, Spec
+from pacesetter.config import Config
+from pacesetter.envs import Environment
+from pacesetter.errors import TrainingError
+from pacesetter.policy import Floats, Policy, clip, normalize, unstack
+from pacesetter.seeding import Stream, generator
+from pacesetter.training.ensemble import blame
+from pacesetter.training.normalizer import Normalizer, Statistics
+from pacesetter.training.population import Population
+from pacesetter.training.progress import Progress
+from pacesetter.training.replay import Columns, Replay
+
+
+class Iterations:
+    """One learner and its envs; to the trainer and the checkpoint what `Ensemble` is.
+
+    `progress.members` are here the episodes that run, one an env.
+    """
+
+    def __init__(self, config: Config, envs: list[Environment]) -> None:
+        run, hyper, first = config.run, config.hyper, envs[0]
+        self.config, self.envs = config, envs
+        spec = Spec(first.observation_size, first.action_size)
+        self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
+        self.streams = [generator(run.seed, Stream.ACT, k) for k in range(len(envs))]
+        self.columns = Columns(*spec)
+        self.population = Population(
+            self.algorithm, self.columns, run.seed, hyper.normalize_observation
+        )
+        self.states = self.population.init(1, same=False)
+        self.acting = self.population.acting(self.states)
+        self.loss_names = self.population.loss_names(self.states[0])
+        self.normalizer = Normalizer(spec.observation_size)
+        self.budget = run.steps
+        self.replays: list[Replay] = []
+        self.memory = [self.algorithm.begin(self.acting[0], rng) for rng in self.streams]
+        self.progress = Progress.of(len(envs))
+
+    def open_replays(self, folder: Path) -> None:
+        """None is needed."""
+
+    def tick(self) -> None:
+        """One iteration; what is left of the budget at the end is too little to learn from."""
+        size = self.config.hyper.rollout_length * len(self.envs)
+        rows = self.collect(min(size, self.budget - self.progress.step))
+        if len(rows) == size:
+            self.learn(rows.reshape(-1, len(self.envs), self.columns.width))
+        self.progress.tick += 1
+
+    def close(self) -> None:
+        """Let go of the envs."""
+        for env in self.envs:
+            env.close()
+
+    @property
+    def statistics(self) -> Statistics:
+        """What observations are normalised by, now."""
+        return self.normalizer.statistics()
+
+    def ledger(self) -> dict[str, Any]:
+        """What the run has spent."""
+        progress = self.progress
+        actions = sum(member.actions for member in progress.members)
+        extra = self.algorithm.ledger(progress.updates, actions)
+        return progress.ledger() | {"member_steps": [progress.step]} | extra
+
+    def policy(self, member: int) -> Policy:
+        """The policy as it is now."""
+        actors, env = self.algorithm.policy(self.states[member]), self.envs[0]
+        statistics = self.statistics if self.population.normalize else None
+        layers = unstack(actors)
+        return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
+
+    # Collect.
+
+    def collect(self, steps: int) -> Floats:
+        """Rows (steps, width) of that many steps, the envs in turn."""
+        rows = np.empty((steps, self.columns.width), np.float32)
+        statistics = self.statistics
+        for i in range(steps):
+            k = i % len(self.envs)
+            with blame(k, self.progress.step, "env"):
+                rows[i] = self._step(k, statistics)
+        return rows
+
+    def _step(self, k: int, statistics: Statistics) -> Floats:
+        """The row of one step of env k; the action stays uncut, so that its density is known."""
+        progress, member, env = self.progress, self.progress.members[k], self.envs[k]
+        if member.starting:
+            env.reset()
+            member.start(progress.step)
+            self.memory[k] = self.algorithm.begin(self.acting[0], self.streams[k])
+        before = seen = env.observation
+        if self.population.normalize:
+            seen = normalize(before, *statistics)
+        action, self.memory[k] = self.algorithm.act(
+            self.acting[0], self.memory[k], seen, self.streams[k]
+        )
+        if not np.isfinite(action).all():
+            raise TrainingError(f"action is not finite: {action}")
+        step = env.step(clip(action))
+        member.step(step.reward)
+        member.actions += 1
+        if step.ended:
+            progress.episodes += 1
+            progress.ended.append([0, member.episode_return, member.episode_length])
+            member.starting = True
+        discount = self.config.hyper.gamma * (1.0 - step.terminated)
+        mask = np.zeros(0, np.float32)
+        return self.columns.pack(
+            before, action, step.reward, step.observation, discount, step.ended, mask
+        )
+
+    # Learn.
+
+    def learn(self, rows: Floats) -> None:
+        """One update from a rollout (T, E, width)."""
+        progress = self.progress
+        result = self.population.update(
+            self.states[0], 0, progress.updates, rows, None, self.statistics
+        )
+        self.states = [result.state]
+        for name, loss in zip(self.loss_names, np.asarray(result.losses), strict=True):
+            if not np.isfinite(loss):
+                raise TrainingError(f"step {progress.step}: {name} is {loss}")
+        progress.note(np.asarray(result.losses))
+        self.acting = [jax.tree.map(np.asarray, result.acting)]
+        progress.updates += 1
+        progress.transitions += rows.shape[0] * rows.shape[1]
+        if self.population.normalize:
+            for row in rows.reshape(-1, self.columns.width):
+                self.normalizer.add(row[: self.columns.observation])
