@@ -1,0 +1,1 @@
+"""Many runs: start them, tune them, compare them."""
