@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +57,8 @@ def load(name: str) -> Suite:
     for name, entry in entries.items():
         if not isinstance(entry, dict):
             raise UsageError(f"suite: {path}: entries.{name} must be a table")
+        if not isinstance(entry.get("algorithm", name), str):
+            raise UsageError(f"suite: {path}: entries.{name}: algorithm must be a name")
     named = {name: _plain(entry) for name, entry in entries.items()}
     return Suite(path.stem, str(about), table, named, path.parent)
 
@@ -89,25 +92,25 @@ def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
             for env in _envs(said.get("envs")):
                 below = _file(suite, said.get("config"), env)
                 own = {**suite.shared, **below, **entry, **flags}
-                jobs += [_job(name, env, seed, own, runs) for seed in _seeds(said.get("seeds", 1))]
+                jobs += _jobs(name, env, _seeds(said.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
-def _job(name: str, env: str, seed: int, said: Settings, runs: str | Path) -> Job:
+def _jobs(name: str, env: str, seeds: list[int], said: Settings, runs: str | Path) -> Iterable[Job]:
     own = {key: value for key, value in said.items() if key not in ("envs", "seeds", "config")}
     algorithm = own.pop("algorithm", name)
-    if not isinstance(algorithm, str):
-        raise UsageError(f"algorithm: must be a name, it is {algorithm!r}")
     for key in DECIDED:
         if key in own:
             raise UsageError(f"{key}: is for the entry's name, envs and seeds to say")
-    config = settle(algorithm, env, own, {"name": name, "seed": seed})
-    usual = settle(algorithm, env, {"seed": seed}).settings()
-    differing = {k: v for k, v in config.settings().items() if v != usual[k]}
-    words = ["train", algorithm, env, f"--seed={seed}", *_flags(differing), f"--runs={runs}"]
-    return Job(config, RunDirectory.of(runs, config), words)
+    run, hyper = settle(algorithm, env, own, {"name": name})
+    usual = settle(algorithm, env).settings()
+    differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
+    for seed in seeds:
+        config = Config(replace(run, seed=seed), hyper)
+        words = ["train", algorithm, env, f"--seed={seed}", *_flags(differing), f"--runs={runs}"]
+        yield Job(config, RunDirectory.of(runs, config), words)
 
 
 def _flags(settings: Settings) -> Iterable[str]:

@@ -148,7 +148,7 @@ class Tuning:
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
         number = trial.number
         given: Settings = {**self.fixed, **trial.params}
-        own = {"name": f"trial-{number}", "seed": TUNING_SEEDS + number}
+        own: Settings = {"name": f"trial-{number}", "seed": TUNING_SEEDS + number}
         config = settle(self.algorithm, self.env, given, own)
         directory = RunDirectory.of(self.runs, config)
         if not directory.config_file.exists():
