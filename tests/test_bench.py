@@ -8,10 +8,12 @@ import stat
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from conftest import assert_same
@@ -23,7 +25,7 @@ from pacesetter.flags import add_settings, parser, split_env_kwargs
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.study import bench as bench_module
 from pacesetter.study import display, suite
-from pacesetter.study.bench import Bench, Outcome, is_finished
+from pacesetter.study.bench import RETRIES, Bench, Outcome, is_finished
 from pacesetter.study.executors import Local
 from pacesetter.study.suite import Job, expand, load
 from pacesetter.training.trainer import Trainer
@@ -616,3 +618,124 @@ def test_ray_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match=r"ray is not installed; pip install .*\[scale\]"):
         Ray(None, None)
+
+
+# Kills, and clusters.
+
+MANY = f"""envs = ["Pendulum-v1"]
+seeds = 20
+{SUITE.split(chr(10), 1)[1].split("[entries", 1)[0]}
+checkpoint_every = 0.2
+[entries.td3]
+[entries.multi-td3]
+""".replace("steps = 400", "steps = 1500")
+KILLS = 24
+
+
+def children(process: subprocess.Popen[str]) -> list[tuple[int, str]]:
+    """Process numbers and command lines of a bench's runs (Linux)."""
+    found: list[tuple[int, str]] = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int(re.sub(r".*\) ", "", (path / "stat").read_text()).split()[1])
+            if parent == process.pid:
+                found.append((int(path.name), (path / "cmdline").read_text()))
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def run_of(command: str) -> tuple[str, str]:
+    """Name and seed of the run that a command line begins or resumes."""
+    words = command.split("\0")
+    place = next(i for i, word in enumerate(words) if word in ("train", "resume"))
+    if words[place] == "resume":
+        return tuple(Path(words[place + 1]).parts[-2:])
+    (seed,) = [word.removeprefix("--seed=") for word in words if word.startswith("--seed=")]
+    return words[place + 1], seed
+
+
+@pytest.mark.slow
+def test_bench_under_kills_equals_undisturbed(here: Path) -> None:
+    """40 runs; workers are killed at any moment, no run more often than is forgiven, and so is the
+    bench, twice; what it leaves behind goes on beside the next one."""
+    (here / "many.toml").write_text(MANY)
+    rng = np.random.default_rng(5)
+    killed: Counter[tuple[str, str]] = Counter()
+    process = start("many.toml", "--jobs", "2", "--runs", "killed")
+    for number in range(KILLS):
+        while True:
+            time.sleep(float(rng.uniform(0.2, 3.0)))
+            assert process.poll() is None, process.communicate()
+            targets = [(pid, run_of(text)) for pid, text in children(process) if "-q" in text]
+            targets = [(pid, run) for pid, run in targets if killed[run] < RETRIES]
+            if targets:
+                break
+        pid, victim = targets[rng.integers(len(targets))]
+        os.kill(pid, signal.SIGKILL)
+        killed[victim] += 1
+        if number in (KILLS // 3, 2 * KILLS // 3):
+            process.kill()
+            process.communicate()
+            process = start("many.toml", "--jobs", "2", "--runs", "killed")
+    out, err = process.communicate(timeout=900)
+    assert process.returncode == 0, err
+    assert "40 of 40 runs finished" in out
+    assert out.endswith("0 failed\n")
+    assert killed.total() == KILLS
+    again = start("many.toml", "--runs", "killed")
+    assert again.communicate()[0].startswith("40 of 40 runs finished, 40 of them before")
+    assert start("many.toml", "--jobs", "2", "--runs", "whole").wait(timeout=900) == 0
+    whole = [*find_all("whole")]
+    assert len(whole) == 40
+    for one in whole:
+        other = RunDirectory("killed" / one.path.relative_to("whole"))
+        assert_same(one, other)
+        budget_spent = [row for row in other.rows() if row["step"] >= 1500]
+        assert sorted(row["kind"] for row in budget_spent if row["kind"] != "select") == [
+            "eval",
+            "train",
+        ]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_ray_cluster(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two nodes: a task a run; a lost command is tried again; stopping saves, and all goes on."""
+    pytest.importorskip("ray", reason="ray is not installed: pip install 'pacesetter[scale]'")
+    from ray.cluster_utils import Cluster
+
+    from pacesetter.study.executors import Ray
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        executor = Ray(None, cluster.address)
+        assert executor.slots == 2
+        long = {"steps": 10**6, "eval_every": 10**6, "warmup": 10**6, "replay_size": 1000}
+        endless = expand(load("suite.toml"), long, "long")
+        work = Bench(endless)
+        logs = [job.directory.metrics_file for job in endless]
+        killed = False
+        for _ in work.run(executor):
+            ready = all(log.exists() and '"train"' in log.read_text() for log in logs)
+            if ready and not killed:
+                holder = (endless[0].directory.path / "lock").read_text().split()[1]
+                os.kill(int(holder), signal.SIGKILL)
+                killed = True
+            if "trying again" in "".join(work.news) and endless[0].directory.in_use():
+                work.stop()
+        assert [job.directory.in_use() for job in endless] == [False, False]
+        assert sum("stopped" in line for line in work.news) == 2
+        for job in endless:
+            trainer = Trainer.resume(job.directory.path)
+            assert trainer.progress.step > 0
+            trainer.close()
+        work = run(jobs, executor)
+        assert (work.finished, work.failed) == (jobs, {}) or len(work.finished) == 2
+        assert run(jobs, Here()).before == 2
+    finally:
+        import ray
+
+        ray.shutdown()
+        cluster.shutdown()

@@ -24,10 +24,12 @@ from pacesetter.study.suite import TUNING_SEEDS, expand, of_algorithms
 optuna = pytest.importorskip("optuna")
 
 from pacesetter.study import tune  # noqa: E402
-from pacesetter.study.tune import Tuning, ranges  # noqa: E402
+from pacesetter.study.journal import distribution, ranges  # noqa: E402
+from pacesetter.study.tune import Tuning  # noqa: E402
 
 PROBE = "broken_envs:Probe-v0"
-FIXED: dict[str, Any] = {**TINY, "steps": 400, "eval_every": 100, "warmup": 100}
+# Its trials never come to an update, since compiling one takes longer than all else.
+FIXED: dict[str, Any] = {**TINY, "steps": 400, "eval_every": 100, "warmup": 1_000}
 FLAGS = [
     word
     for key, value in FIXED.items()
@@ -73,14 +75,14 @@ def test_ranges(name: str) -> None:
     found = ranges(hyper, {})
     assert found
     for key, one in found.items():
-        ends = one.choices if hasattr(one, "choices") else (one.low, one.high)
-        for end in ends:
+        for end in (one.low, one.high):
             assert getattr(settle(name, "X-v0", {key: end}).hyper, key) == end
+            assert distribution(one)._contains(end)
     assert key not in ranges(hyper, {key: 1})
 
 
 def test_what_td3_searches() -> None:
-    """Nothing that changes the cost of a step; DDPG's fixed settings are not searched."""
+    """Nothing that changes the number of updates; DDPG's fixed settings are not searched."""
     searched = {"gamma", "normalize_observation", "batch_size", "warmup", "actor_learning_rate"}
     searched |= {"critic_learning_rate", "tau", "policy_delay", "target_noise"}
     searched |= {"exploration_noise", "critic_layer_norm", "actor_layer_norm"}
@@ -196,11 +198,11 @@ def test_trial_of_a_living_worker_is_left_alone() -> None:
 
 
 def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:
-    """It stops early, has no score, and is not the best."""
+    """It stops early and is never the best."""
     tuning = study(trials=2)
     tuning.study.pruner = optuna.pruners.ThresholdPruner(lower=1e9)
     tuning.run(quiet=True)
-    assert [(state, value) for state, value, *_ in made(tuning)] == [("PRUNED", None)] * 2
+    assert [state for state, *_ in made(tuning)] == ["PRUNED"] * 2
     assert all(list(reported) == [1] for *_, reported in made(tuning))
     assert not tuning.best_file.exists()
     assert tuning.summary() == "0 trials, 2 pruned, 0 failed"
@@ -211,7 +213,7 @@ def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_bad_trials_are_pruned_by_what_others_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """With five good ones and a sixth that is worse from the start."""
-    scores = iter([10.0] * 20)
+    scores = iter([10.0] * 25)
     monkeypatch.setattr(tune, "_score", lambda rows: next(scores, -5.0))
     tuning = study(trials=6)
     tuning.run(quiet=True)
@@ -295,7 +297,7 @@ def worker(*words: str) -> subprocess.Popen[str]:
 
 def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     """All trials are made, each once; the survivor takes up what the other left."""
-    words = ("--trials", "6", "--steps", "3000", "--study", "s.log")
+    words = ("--trials", "5", "--steps", "1500", "--warmup", "900", "--study", "s.log")
     both = [worker(*words), worker(*words)]
     victim, survivor = both
     end = time.monotonic() + 120
@@ -309,12 +311,14 @@ def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     victim.communicate()
     out, err = survivor.communicate(timeout=120)
     assert survivor.returncode == 0, err
-    assert out.startswith("6 trials, 0 pruned, 0 failed") or "pruned" in out
-    done = sorted(int(n) for n in re.findall(r"^trial (\d) of 6", err, re.MULTILINE))
+    counts = re.match(r"(\d) trials, (\d) pruned, 0 failed; best", out)
+    assert counts
+    assert int(counts[1]) + int(counts[2]) == 5
     names = {run.settings()["name"] for run in find_all("s.log.runs")}
-    assert names == {f"trial-{number}" for number in range(6)}
-    assert len(done) == len({*done})
-    assert set(done) >= {*range(6)} - {0, 1}
+    assert names == {f"trial-{number}" for number in range(5)}
+    # The victim had come to a trial's second half at most, and the survivor made the rest.
+    done = re.findall(r"^trial (\d) of 5", err, re.MULTILINE)
+    assert len(done) == len({*done}) >= 4
     assert json.loads(Path("s.log").read_text().splitlines()[0])["op_code"] == 0
     assert tomllib.loads(Path("s.best.toml").read_text())
 

@@ -53,6 +53,10 @@ class Tune(NamedTuple):
     high: float
     log: bool = False
 
+    def has(self, value: Any) -> bool:
+        """Whether a value lies in it."""
+        return self.low <= value <= self.high
+
 
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]

@@ -1,15 +1,12 @@
-"""Search settings with Optuna: a trial is a run, a study a journal file that workers share.
+"""Search settings with Optuna: a trial is a run, and a study's file is shared by its workers.
 
-A trial belongs to the process that holds its lock file. One whose worker died is taken up by
-whoever looks next and goes on from its checkpoint, so that no heartbeat is needed.
+A trial belongs to the process that holds its lock. One whose worker died is taken up by whoever
+looks next and goes on from its checkpoint, so no heartbeat is needed.
 """
 
-import fcntl
 import json
 import shutil
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -18,24 +15,28 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.config import Settings, Tune, settle
+from pacesetter.config import Settings, settle
 from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.sinks import Sink, console
 from pacesetter.storage import write_atomically
+from pacesetter.study.journal import (
+    alone,
+    distribution,
+    hold,
+    open_study,
+    optuna,
+    ranges,
+    refuse_foreign,
+)
 from pacesetter.study.suite import TUNING_SEEDS
 from pacesetter.training.trainer import Trainer
 
-try:
-    import optuna
-    from optuna.storages.journal import JournalFileBackend, JournalStorage
-except ImportError:
-    raise UsageError("tune: Optuna is not installed; pip install 'pacesetter[tune]'") from None
-
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
 PRUNED, FAILED = optuna.trial.TrialState.PRUNED, optuna.trial.TrialState.FAIL
-LAST = 3  # evaluations that a score is the mean of, or a tenth of all
+SAID = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
+LAST = 3  # evaluations that make a score, or a tenth of all
 
 
 class Tuning:
@@ -44,25 +45,38 @@ class Tuning:
     def __init__(
         self, algorithm: str, env: str, fixed: Settings, trials: int, file: str | Path
     ) -> None:
-        if trials < 1:
-            raise UsageError(f"trials: must be at least 1, got {trials}")
-        for key in ("seed", "name"):
-            if key in fixed:
-                raise UsageError(
-                    f"{key}: trials have names and seeds (from {TUNING_SEEDS}) of their own"
-                )
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
-        self.config = settle(algorithm, env, fixed)
+        self.config, self.file = settle(algorithm, env, fixed), Path(file)
         self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
-        if not self.ranges:
-            raise UsageError("tune: no setting is left to search; each is given or has no range")
-        make(env, self.config.run.env_kwargs).close()
-        self.file = Path(file)
+        self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
         self.runs = self.file.with_name(f"{self.file.name}.runs")
+        self._lock = self.runs / "lock"
         self._trainer: Trainer | None = None
         self._stopping = False
-        self.study = self._open()
+        settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
+        run = self.config.run
+        try:
+            self.runs.mkdir(parents=True, exist_ok=True)
+            with alone(self._lock):
+                patience = run.steps // run.eval_every // 3
+                self.study = open_study(self.file, settings, self.ranges, patience)
+        except OSError as error:
+            raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
+
+    def _refuse_bad_input(self) -> None:
+        """Before anything is written."""
+        if self.trials < 1:
+            raise UsageError(f"trials: must be at least 1, got {self.trials}")
+        for key in ("seed", "name"):
+            if key in self.fixed:
+                raise UsageError(f"{key}: trials have their own; seeds start at {TUNING_SEEDS}")
+        if not self.ranges:
+            raise UsageError("tune: no setting is left to search; each is given or has no range")
+        if not self.file.name or self.file.is_dir():
+            raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
+        refuse_foreign(self.file)
+        make(self.env, self.config.run.env_kwargs).close()
 
     def stop(self) -> None:
         """Ask for the end once the running trial has saved; may be called from a handler."""
@@ -72,12 +86,12 @@ class Tuning:
 
     @property
     def over(self) -> bool:
-        """Whether all trials have been made."""
+        """Whether all trials have ended."""
         trials = self.study.get_trials(deepcopy=False)
-        return len([t for t in trials if t.state.is_finished()]) >= self.trials
+        return sum(trial.state.is_finished() for trial in trials) >= self.trials
 
     def run(self, quiet: bool = False) -> None:
-        """Make trials until all are made or being made by other workers."""
+        """Make trials until all have ended or other workers are at them."""
         while not self._stopping and (claim := self._claim()):
             trial, lock = claim
             with lock:
@@ -86,35 +100,34 @@ class Tuning:
 
     def summary(self) -> str:
         """How many trials there were and where the best settings are."""
-        trials = self.study.get_trials(deepcopy=False)
-        states = {s: len([t for t in trials if t.state == s]) for s in (COMPLETE, PRUNED, FAILED)}
-        text = f"{states[COMPLETE]} trials, {states[PRUNED]} pruned, {states[FAILED]} failed"
-        if not states[COMPLETE]:
+        states = [trial.state for trial in self.study.get_trials(deepcopy=False)]
+        complete, pruned, failed = (states.count(s) for s in (COMPLETE, PRUNED, FAILED))
+        text = f"{complete} trials, {pruned} pruned, {failed} failed"
+        if not complete:
             return text
         best = self.study.best_trial
         return f"{text}; best {best.value:.1f} in trial {best.number}\nsettings: {self.best_file}"
 
-    # One trial.
-
     def _claim(self) -> tuple[optuna.Trial, TextIOWrapper] | None:
         """A trial that a dead worker left, or a new one, and its lock; None if there is none."""
-        with self._locked():
+        with alone(self._lock):
             for left in self.study.get_trials(deepcopy=False, states=(RUNNING,)):
-                if lock := _hold(self.runs / f"{left.number}.lock"):
+                if lock := hold(self.runs / f"{left.number}.lock"):
+                    # Optuna opens the trial of another process by nothing but this.
                     identity = left._trial_id  # pyright: ignore[reportPrivateUsage]
                     return optuna.Trial(self.study, identity), lock
             begun = [t for t in self.study.get_trials(deepcopy=False) if t.state.name != "WAITING"]
             if len(begun) >= self.trials:
                 return None
-            # Seeded by the number, one worker makes the same trials whenever it is stopped.
+            # Seeded by the number: one worker makes the same trials, however often it is stopped.
             self.study.sampler = optuna.samplers.TPESampler(seed=len(begun))
-            trial = self.study.ask(self.ranges)
-            lock = _hold(self.runs / f"{trial.number}.lock")
+            trial = self.study.ask({name: distribution(r) for name, r in self.ranges.items()})
+            lock = hold(self.runs / f"{trial.number}.lock")
             assert lock is not None
             return trial, lock
 
     def _try(self, trial: optuna.Trial, quiet: bool) -> None:
-        """Train one to its end, its pruning, a fault, or `stop`, after which it stays open."""
+        """Train one to its end, its pruning, a fault, or `stop`, which leaves it open."""
         try:
             self._trainer = trainer = self._trainer_of(trial)
             with console(trainer, quiet) as sink:
@@ -139,139 +152,51 @@ class Tuning:
             number = report.step // every
             if report.kind != "eval" or number == 0:
                 continue
-            if number not in told:  # else the log was cut back and these are made again
+            if number not in told:  # a resumed run makes again what it had not saved
                 trial.report(_score(trainer.directory.rows()), number)
             if trial.should_prune() and not trainer.finished:
                 return True
         return False
 
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
-        number = trial.number
         given: Settings = {**self.fixed, **trial.params}
-        own: Settings = {"name": f"trial-{number}", "seed": TUNING_SEEDS + number}
-        config = settle(self.algorithm, self.env, given, own)
+        given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
+        config = settle(self.algorithm, self.env, given)
         directory = RunDirectory.of(self.runs, config)
         if not directory.config_file.exists():
-            return Trainer(self.algorithm, self.env, runs=self.runs, **(given | own))
+            return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
             trainer = Trainer.resume(directory.path)
-        except UsageError as error:  # damaged: no reason to stop the study
+        except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
             print(f"pacesetter: {note}", file=sys.stderr)
         return trainer
 
     def _tell(self, trial: optuna.Trial, state: Any, value: float | None, text: str) -> None:
-        with self._locked():
+        with alone(self._lock):
             self.study.tell(trial, value, state)
             if any(t.state == COMPLETE for t in self.study.get_trials(deepcopy=False)):
                 best = self.study.best_trial
                 text = f"{text}, best {best.value:.1f} in trial {best.number}"
                 write_atomically(self.best_file, self._best_toml(best).encode())
-        word = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}[state]
-        print(f"trial {trial.number} of {self.trials}: {word} {text}", file=sys.stderr, flush=True)
-
-    # The study's files.
-
-    def _open(self) -> optuna.Study:
-        optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self._refuse_foreign()
-        evaluations = self.config.run.steps // self.config.run.eval_every
-        try:
-            self.runs.mkdir(parents=True, exist_ok=True)
-            with self._locked():
-                study = optuna.create_study(
-                    storage=JournalStorage(JournalFileBackend(str(self.file))),
-                    study_name="pacesetter",
-                    direction="maximize",
-                    pruner=optuna.pruners.MedianPruner(n_warmup_steps=evaluations // 3),
-                    load_if_exists=True,
-                )
-                self._refuse_other(study)
-        except OSError as error:
-            raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
-        return study
-
-    def _refuse_foreign(self) -> None:
-        """Refuse a file that is no journal, onto which Optuna would write all the same."""
-        try:
-            with self.file.open() as file:
-                line = file.readline()
-            if line and "op_code" not in json.loads(line):
-                raise ValueError("no journal of Optuna")
-        except FileNotFoundError:
-            pass
-        except (OSError, ValueError, TypeError) as error:
-            raise UsageError(f"study: {self.file} is no study: {error}") from None
-
-    def _refuse_other(self, study: optuna.Study) -> None:
-        """Refuse a study of other settings; a new one begins with the defaults."""
-        settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
-        searched = {f"range of {name}": repr(range_) for name, range_ in self.ranges.items()}
-        new: Settings = json.loads(json.dumps(settings | searched))
-        old = study.user_attrs.get("about")
-        if old is None:
-            study.set_user_attr("about", new)
-            usual = {name: settings[name] for name in self.ranges}
-            inside = {k: v for k, v in usual.items() if self.ranges[k]._contains(v)}
-            study.enqueue_trial(inside)
-            return
-        for key in {**old, **new}:
-            if old.get(key) != new.get(key):
-                raise UsageError(
-                    f"study: {self.file} has {key}={old.get(key)}, not {new.get(key)}; "
-                    "give another --study"
-                )
+        print(
+            f"trial {trial.number} of {self.trials}: {SAID[state]} {text}",
+            file=sys.stderr,
+            flush=True,
+        )
 
     def _best_toml(self, best: optuna.trial.FrozenTrial) -> str:
         run = self.config.run
         given = {k: self.config.settings()[k] for k in self.fixed if k not in ("steps", "time")}
-        return "\n".join(
-            [
-                f"# pacesetter train {self.algorithm} {run.env} --config {self.best_file}",
-                f"# Return {best.value:.1f} at {run.steps:,} steps, in trial {best.number} with "
-                f"seed {TUNING_SEEDS + best.number}: the best",
-                "# of many trials, so biased upwards; only runs with other seeds tell what it is.",
-                *(f"{key} = {_toml(value)}" for key, value in (given | best.params).items()),
-                "",
-            ]
-        )
-
-    @contextmanager
-    def _locked(self) -> Generator[None]:
-        """One worker at a time claims or tells."""
-        with (self.runs / "lock").open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
-
-
-def ranges(hyper: type, fixed: Settings) -> dict[str, Any]:
-    """What Optuna searches: the settings that declare a range and are not fixed."""
-    found: dict[str, Any] = {}
-    for name, info in vars(hyper)["__pydantic_fields__"].items():
-        for mark in info.metadata:
-            if isinstance(mark, Tune) and name not in fixed:
-                found[name] = _distribution(*mark)
-    return found
-
-
-def _distribution(low: Any, high: Any, log: bool) -> Any:
-    if isinstance(low, bool):
-        return optuna.distributions.CategoricalDistribution([low, high])
-    if isinstance(low, int):
-        return optuna.distributions.IntDistribution(low, high, log)
-    return optuna.distributions.FloatDistribution(low, high, log)
-
-
-def _hold(path: Path) -> TextIOWrapper | None:
-    """A file locked until it is closed or the process ends; None if another process holds it."""
-    file = path.open("a")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
-        return None
-    return file
+        lines = [
+            f"# pacesetter train {self.algorithm} {run.env} --config {self.best_file}",
+            f"# Return {best.value:.1f} at {run.steps:,} steps in trial {best.number}, with seed "
+            f"{TUNING_SEEDS + best.number}: the best of",
+            "# many, so biased upwards; only runs with other seeds tell what these settings give.",
+            *(f"{key} = {_toml(value)}" for key, value in (given | best.params).items()),
+        ]
+        return "\n".join(lines) + "\n"
 
 
 def _score(rows: list[Row]) -> float:
