@@ -118,11 +118,12 @@ def tune(words: list[str]) -> int:
     """Search the settings of ALGO on ENV that score best, with Optuna."""
     from pacesetter import algorithms
 
-    command = parser("tune ALGO ENV", "Search good settings; call it again to go on, or beside it.")
+    command = parser("tune ALGO ENV", "Search settings; call it again to go on, or beside it.")
     if len(words) < 2 or words[0].startswith("-") or words[1].startswith("-"):
         command.add_argument("ALGO", help="an algorithm or preset: `pacesetter list algorithms`")
         command.add_argument("ENV", help="a Gymnasium id such as HalfCheetah-v5, or module:Id-v0")
         _add_tune_flags(command)
+        command.epilog = "`pacesetter tune ALGO ENV --help` shows the settings that can be fixed"
         command.parse(words)
     algorithm, env = words[:2]
     fix_threads()
