@@ -114,6 +114,7 @@ def test_score_is_the_mean_of_the_last_evaluations() -> None:
 def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     """Its settings, and those that the study had fixed; its budget and seed are not."""
     words = ["tune", "td3", PROBE, *FLAGS, "--env.gain", "2", "--study", "a.log", "--trials", "2"]
+    words += ["--warmup", "300"]  # these two do come to updates
     assert main([*words, "-q"]) == 0
     printed = capsys.readouterr()
     assert re.match(r"2 trials, 0 pruned, 0 failed; best [\d.]+ in trial (\d)\n", printed.out)
@@ -126,7 +127,9 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     table = tomllib.loads(text)
     assert "steps" not in table
     assert table["env_kwargs"] == {"gain": 2}
-    best = Tuning("td3", PROBE, FIXED | {"env_kwargs": {"gain": 2}}, 2, "a.log").study.best_trial
+    best = Tuning(
+        "td3", PROBE, FIXED | {"env_kwargs": {"gain": 2}, "warmup": 300}, 2, "a.log"
+    ).study.best_trial
     flags = ["--config", "a.best.toml", "--steps", "200", "-q"]
     assert main(["train", "td3", PROBE, *flags]) == 0
     settings = find("td3/0").settings()
@@ -211,6 +214,7 @@ def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:
         assert not run.state_file.parent.exists()
 
 
+@pytest.mark.slow
 def test_bad_trials_are_pruned_by_what_others_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """With five good ones and a sixth that is worse from the start."""
     scores = iter([10.0] * 25)
@@ -297,7 +301,7 @@ def worker(*words: str) -> subprocess.Popen[str]:
 
 def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     """All trials are made, each once; the survivor takes up what the other left."""
-    words = ("--trials", "5", "--steps", "1500", "--warmup", "900", "--study", "s.log")
+    words = ("--trials", "4", "--steps", "1500", "--warmup", "1M", "--study", "s.log")
     both = [worker(*words), worker(*words)]
     victim, survivor = both
     end = time.monotonic() + 120
@@ -313,12 +317,12 @@ def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     assert survivor.returncode == 0, err
     counts = re.match(r"(\d) trials, (\d) pruned, 0 failed; best", out)
     assert counts
-    assert int(counts[1]) + int(counts[2]) == 5
+    assert int(counts[1]) + int(counts[2]) == 4
     names = {run.settings()["name"] for run in find_all("s.log.runs")}
-    assert names == {f"trial-{number}" for number in range(5)}
+    assert names == {f"trial-{number}" for number in range(4)}
     # The victim had come to a trial's second half at most, and the survivor made the rest.
-    done = re.findall(r"^trial (\d) of 5", err, re.MULTILINE)
-    assert len(done) == len({*done}) >= 4
+    done = re.findall(r"^trial (\d) of 4", err, re.MULTILINE)
+    assert len(done) == len({*done}) >= 3
     assert json.loads(Path("s.log").read_text().splitlines()[0])["op_code"] == 0
     assert tomllib.loads(Path("s.best.toml").read_text())
 
