@@ -82,7 +82,9 @@ def _all() -> list[RunDirectory]:
 HELP = {
     "resume": ["RUN", "--steps", "--time", "--runs", "--quiet"],
     "eval": ["RUN|FILE", "--episodes", "--seed", "--noise", "--env", "--json", "--runs"],
-    "list": ["algorithms|envs|rules|presets|runs", "--runs"],
+    "list": ["algorithms|envs|rules|presets|suites|runs", "--runs"],
+    "bench": ["SUITE|FILE.toml", "pilot", "--algos", "--envs", "--seeds", "--jobs", "--print"],
+    "tune": ["ALGO", "ENV", "--trials", "--study"],
     "show": ["RUN", "--runs"],
     "train": ["ALGO", "ENV", "--help"],
 }
@@ -149,8 +151,8 @@ NO_JAX = """
 import sys
 from pacesetter.cli import main
 for words in ["--help", "--version", "train --help", "resume --help", "eval --help", "list --help",
-              "show --help", "list algorithms", "list envs", "list rules", "list presets",
-              "list runs"]:
+              "show --help", "bench --help", "tune --help", "list algorithms", "list envs",
+              "list rules", "list presets", "list suites", "list runs"]:
     try:
         code = main(words.split())
     except SystemExit as end:
@@ -170,6 +172,7 @@ LISTS = {
     "envs": ["HalfCheetah-v5", "Ant-v4", "Humanoid-v5", "pacesetter/Ant111-v4", "module:Id"],
     "rules": ["none", "best", "random", "top_half", "tournament"],
     "presets": ["td3-paper", "ddpg-original", "demo", "Fujimoto", "Lillicrap"],
+    "suites": ["smoke", "pilot", "published", "paper-table-1", "paper-table-2"],
     "runs": ["no runs below runs"],
 }
 

@@ -2,22 +2,21 @@
 
 import json
 import os
-import signal
 import sys
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from pacesetter.errors import TrainingError, UsageError, unknown
 from pacesetter.flags import Parser, add_settings, parser, split_env_kwargs
+from pacesetter.process import exit_code, fix_threads, stopping
+from pacesetter.study.verbs import bench, tune
 
 if TYPE_CHECKING:
     from pacesetter.training.trainer import Trainer
 
 _OUTPUT_HELP = ".html report, .md or .tex tables, .pdf curves; may be given several times"
-NOUNS = ("algorithms", "envs", "rules", "presets", "runs")
+NOUNS = ("algorithms", "envs", "rules", "presets", "suites", "runs")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -61,7 +60,7 @@ def train(words: list[str]) -> int:
         command.parse(words)
     algorithm, env, rest = words[0], words[1], words[2:]
     base, _ = preset_layers(algorithm, env)
-    _fix_threads(None)
+    fix_threads(None)
     defaults = settle(algorithm, env).settings()
     command.prog = f"pacesetter train {algorithm} {env}"
     add_settings(command, "the run", Run, defaults)
@@ -91,7 +90,7 @@ def resume(words: list[str]) -> int:
     _add_common(command)
     found = command.parse(words)
     directory = find(found.run, found.runs)
-    _fix_threads(directory.record().get("threads"))
+    fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
     trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
@@ -137,7 +136,7 @@ def evaluate(words: list[str]) -> int:
 
 def list_(words: list[str]) -> int:
     """List what there is of a noun."""
-    command = parser("list", "List algorithms, envs, rules, presets or runs.")
+    command = parser("list", "List algorithms, envs, rules, presets, suites or runs.")
     command.add_argument("noun", metavar="|".join(NOUNS))
     command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
     found = command.parse(words)
@@ -211,6 +210,8 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "list": list_,
     "show": show,
     "compare": compare,
+    "bench": bench,
+    "tune": tune,
 }
 
 
@@ -234,18 +235,11 @@ def _add_common(command: Parser) -> None:
     command.add_argument("-q", "--quiet", action="store_true", help="no progress")
 
 
-def _fix_threads(count: int | None) -> None:
-    """Fix the size of XLA's thread pool, which decides result bits, before JAX is imported."""
-    if count is not None:
-        os.environ["NPROC"] = str(count)
-    os.environ.setdefault("NPROC", str(len(os.sched_getaffinity(0))))
-
-
 def _train(trainer: "Trainer", quiet: bool) -> int:
     from pacesetter.sinks import console
 
     final: Any = None
-    with _stopping_at_signals(trainer) as received, console(trainer, quiet) as sink:
+    with stopping(trainer.stop) as received, console(trainer, quiet) as sink:
         for report in trainer:
             sink(report)
             final = report if report.kind == "eval" else final
@@ -254,29 +248,9 @@ def _train(trainer: "Trainer", quiet: bool) -> int:
     print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")
     if received and not trainer.finished:
         print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
-        return 130 if received[0] == signal.SIGINT else 143
+        return exit_code(received)
     print(f"policy: {trainer.directory.policy_file}")
     return 0
-
-
-@contextmanager
-def _stopping_at_signals(trainer: "Trainer") -> Generator[list[int]]:
-    """The first signal ends the run cleanly after its tick; the second ends the process."""
-    received: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if received:
-            os._exit(128 + number)
-        received.append(number)
-        trainer.stop()
-
-    watched = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-    before = {number: signal.signal(number, handle) for number in watched}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

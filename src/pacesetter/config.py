@@ -97,24 +97,48 @@ REPLAYS = {
     "lap": (0.4, 0.0),
     "return": (0.6, 0.0),
 }
+
+
+class Tune(NamedTuple):
+    """Range in which `tune` searches the setting that is annotated with it; or False and True."""
+
+    low: float
+    high: float
+    log: bool = False
+
+    def has(self, value: Any) -> bool:
+        """Whether a value lies in it."""
+        return self.low <= value <= self.high
+
+
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
 Duration = Annotated[float, BeforeValidator(_duration)]
+LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
+Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]
+Warmup = Annotated[Count, Tune(1_000, 25_000, log=True)]
+Switch = Annotated[bool, Tune(False, True)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Hyper:
     """Settings that every algorithm has; each algorithm's own `Hyper` adds to them."""
 
-    gamma: float = Field(0.99, ge=0, le=1, description="discount a step")
-    normalize_observation: bool = Field(False, description="running mean and deviation, cut at 10")
+    gamma: Annotated[float, Tune(0.97, 0.999)] = Field(
+        0.99, ge=0, le=1, description="discount a step"
+    )
+    normalize_observation: Switch = Field(
+        False, description="running mean and deviation, cut at 10"
+    )
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class OffPolicy(Hyper):
     """Settings of every algorithm that learns from a replay."""
 
-    batch_size: int = Field(256, ge=1, description="transitions in a minibatch")
+    batch_size: Annotated[int, Tune(64, 512, log=True)] = Field(
+        256, ge=1, description="transitions in a minibatch"
+    )
     replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
     replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
         "uniform", description="rows are drawn alike, by TD error (PER; LAP) or by episode return"
@@ -142,7 +166,7 @@ class OffPolicy(Hyper):
     assess_after: Annotated[Count | None, AfterValidator(_assessed)] = Field(
         None, ge=0, description="a member's updates before which one assesses; none is 750000"
     )
-    warmup: Count = Field(25_000, ge=0, description="first steps of all members, uniform actions")
+    warmup: Warmup = Field(25_000, ge=0, description="first steps of all members, uniform actions")
     warmup_updates: bool = Field(False, description="update during the warm-up too")
     updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
     update_at: Literal["step", "episode"] = Field(

@@ -28,23 +28,32 @@ class Parser(argparse.ArgumentParser):
             raise UsageError(f"argument: '{rest[0]}' is one too many; see `{self.prog} --help`")
         return found
 
+    def knows(self, flag: str) -> bool:
+        """Whether a flag has been added."""
+        return flag in self._option_string_actions
+
 
 def parser(prog: str, description: str) -> Parser:
     """A parser that takes flags in full only, so that new flags never change what a line means."""
     return Parser(prog=f"pacesetter {prog}", description=description, allow_abbrev=False)
 
 
-def add_settings(command: Parser, title: str, kind: type, defaults: Settings) -> None:
-    """A group of flags: one for each field of a settings class, with help, range and default."""
+def add_settings(command: Parser, title: str, kind: type, defaults: Settings | None) -> None:
+    """A group of flags: one for each field of a settings class, with help, range and default.
+
+    Without defaults, for settings of several algorithms, one flag serves all that have it.
+    """
     into = command.add_argument_group(title)
     infos: dict[str, Any] = kind.__dict__["__pydantic_fields__"]
     for field in fields(kind):
-        if field.name in _POSITIONAL:
+        flag = "--" + field.name.replace("_", "-")
+        if field.name in _POSITIONAL or (defaults is None and command.knows(flag)):
             continue
-        info, default = infos[field.name], defaults[field.name]
-        words = [info.description, *_allowed(info), f"default {_show(default)}"]
+        info = infos[field.name]
+        words = [info.description, *_allowed(info)]
+        words += [] if defaults is None else [f"default {_show(defaults[field.name])}"]
         options: dict[str, Any] = {
-            "help": f"{words[0]} ({'; '.join(words[1:])})".replace("%", "%%"),
+            "help": (words[0] + f" ({'; '.join(words[1:])})" * bool(words[1:])).replace("%", "%%"),
             "default": argparse.SUPPRESS,
             "dest": field.name,
         }
@@ -54,7 +63,7 @@ def add_settings(command: Parser, title: str, kind: type, defaults: Settings) ->
             options |= {"nargs": "+", "metavar": "N"}
         else:
             options["metavar"] = "X"
-        into.add_argument("--" + field.name.replace("_", "-"), **options)
+        into.add_argument(flag, **options)
 
 
 def split_env_kwargs(arguments: list[str]) -> tuple[list[str], Settings]:

@@ -47,6 +47,14 @@ def presets() -> list[str]:
     return _table([(name, table["help"], table["source"]) for name, table in presets().items()])
 
 
+def suites() -> list[str]:
+    """What `bench` ships, how many runs each is, and what it is for."""
+    from pacesetter.study.suite import count, load, shipped
+
+    found = [load(name) for name in shipped()]
+    return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
+
+
 def runs(folder: str) -> list[str]:
     """Runs below a folder: how far each is and how its champion does."""
     rows: list[tuple[Any, ...]] = []

@@ -22,7 +22,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.config import STRICT, Count, OffPolicy, Width
+from pacesetter.config import STRICT, LearningRate, OffPolicy, Switch, Tau, Warmup, Width
 from pacesetter.policy import Actors, Floats, Layers, clip, forward
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -41,19 +41,21 @@ Exploration = Annotated[str, AfterValidator(_policy)]
 class Hyper(OffPolicy):
     """Defaults as in the paper's second version; warm-up is uniform, as in Spinning Up."""
 
-    warmup: Count = Field(10_000, ge=0, description="first steps of all members, uniform actions")
+    warmup: Warmup = Field(10_000, ge=0, description="first steps of all members, uniform actions")
     hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of hidden layers"
     )
-    actor_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the actor")
-    critic_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the critics")
-    alpha_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the log temperature")
+    actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the actor")
+    critic_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the critics")
+    alpha_learning_rate: LearningRate = Field(
+        3e-4, gt=0, description="Adam step of the log temperature"
+    )
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
     target_entropy: float | None = Field(None, description="nats; none is minus the action size")
-    tau: float = Field(0.005, gt=0, le=1, description="share of the network in a target update")
+    tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
     critics: int = Field(2, ge=1, description="critics whose minimum is the target")
-    critic_layer_norm: bool = Field(False, description="layer norm before each critic ReLU")
-    actor_layer_norm: bool = Field(False, description="layer norm before each actor ReLU")
+    critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
+    actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
     quantiles: heads.Quantiles = Field(
         0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
     )

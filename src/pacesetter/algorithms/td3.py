@@ -10,7 +10,7 @@ move all targets a little towards their networks
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.config import STRICT, OffPolicy, Width
+from pacesetter.config import STRICT, LearningRate, OffPolicy, Switch, Tau, Tune, Width
 from pacesetter.exploration import ADAPT_EVERY, KINDS, Kind, adapt_sigma, first_sigma
 from pacesetter.policy import Actors, Floats
 
@@ -35,20 +35,24 @@ class Hyper(OffPolicy):
     hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of hidden layers"
     )
-    actor_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the actor")
-    critic_learning_rate: float = Field(3e-4, gt=0, description="Adam step of the critics")
-    tau: float = Field(0.005, gt=0, le=1, description="share of the network in a target update")
+    actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the actor")
+    critic_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the critics")
+    tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
     critics: int = Field(2, ge=1, description="critics whose minimum is the target")
-    policy_delay: int = Field(2, ge=1, description="critic updates an actor update")
-    target_noise: float = Field(0.2, ge=0, description="deviation of the target action's noise")
+    policy_delay: Annotated[int, Tune(1, 4)] = Field(
+        2, ge=1, description="critic updates an actor update"
+    )
+    target_noise: Annotated[float, Tune(0.1, 0.4)] = Field(
+        0.2, ge=0, description="deviation of the target action's noise"
+    )
     target_noise_clip: float = Field(0.5, ge=0, description="bound of the target action's noise")
-    critic_layer_norm: bool = Field(False, description="layer norm before each critic ReLU")
-    actor_layer_norm: bool = Field(False, description="layer norm before each actor ReLU")
+    critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
+    actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
     quantiles: heads.Quantiles = Field(
         0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
     )
     exploration: Kind = Field("gaussian", description="noise on actions, or on the actor's weights")
-    exploration_noise: float = Field(
+    exploration_noise: Annotated[float, Tune(0.05, 0.4, log=True)] = Field(
         0.1, ge=0, description="deviation of that noise, for parameter of the actions it causes"
     )
 

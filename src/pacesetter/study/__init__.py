@@ -1,1 +1,1 @@
-"""Many runs side by side: statistics, tables, curves and the report."""
+"""Many runs: start them, tune them, compare them."""

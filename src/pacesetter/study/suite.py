@@ -1,0 +1,159 @@
+"""What to run: entries x envs x seeds of a suite file, or of flags, as one checked job a run."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pacesetter.config import Config, Settings, read_file, settle
+from pacesetter.errors import UsageError, unknown
+from pacesetter.runs import RunDirectory
+
+FOLDER = Path(__file__).with_name("suites")
+MOST_SEEDS = 10_000
+TUNING_SEEDS = 2**31  # those of `tune` start here, those of `bench` end here: none is both
+DECIDED = ("algorithm", "env", "name", "seed")
+
+
+class Suite(NamedTuple):
+    """Entries by name, over shared settings; both are settings of `train`, and envs and seeds."""
+
+    name: str
+    help: str
+    shared: Settings
+    entries: dict[str, Settings]
+    folder: Path  # in which config files of entries are looked for
+
+
+class Job(NamedTuple):
+    """One run: its checked settings, its folder, and the words of the command that starts it."""
+
+    config: Config
+    directory: RunDirectory
+    words: list[str]
+
+    def __str__(self) -> str:
+        run = self.config.run
+        return f"{run.env} {run.name} seed {run.seed}"
+
+
+def shipped() -> list[str]:
+    """Names of the suites that come with the package."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def load(name: str) -> Suite:
+    """A shipped suite by its name, or a file by its path."""
+    path = FOLDER / f"{name}.toml" if name in shipped() else Path(name)
+    if path.suffix != ".toml":
+        raise unknown("suite", name, shipped())
+    if not path.is_file():
+        raise UsageError(f"suite: no file {path}; shipped are {', '.join(shipped())}")
+    table = read_file(path)
+    about, entries = table.pop("help", ""), table.pop("entries", None)
+    if not isinstance(entries, dict) or not entries:
+        raise UsageError(f"suite: {path} has no [entries.NAME]")
+    for name, entry in entries.items():
+        if not isinstance(entry, dict):
+            raise UsageError(f"suite: {path}: entries.{name} must be a table")
+        if not isinstance(entry.get("algorithm", name), str):
+            raise UsageError(f"suite: {path}: entries.{name}: algorithm must be a name")
+    named = {name: _plain(entry) for name, entry in entries.items()}
+    return Suite(path.stem, str(about), table, named, path.parent)
+
+
+def of_algorithms(names: Iterable[str]) -> Suite:
+    """A suite of algorithms or presets as they are."""
+    entries: dict[str, Settings] = {name.replace(":", "-"): {"algorithm": name} for name in names}
+    return Suite("bench", "", {}, entries, Path())
+
+
+def pick(suite: Suite, names: Iterable[str]) -> Suite:
+    """Only some entries of a suite."""
+    for name in names:
+        if name not in suite.entries:
+            raise unknown("algos", name, suite.entries)
+    return suite._replace(entries={name: suite.entries[name] for name in names})
+
+
+def count(suite: Suite) -> int:
+    """How many runs it is, without looking at their settings."""
+    tables = [suite.shared | entry for entry in suite.entries.values()]
+    return sum(len(_envs(t.get("envs"))) * len(_seeds(t.get("seeds", 1))) for t in tables)
+
+
+def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
+    """Every run, the first seed of all entries first; flags win over what the suite says."""
+    jobs: list[Job] = []
+    for name, entry in suite.entries.items():
+        said = suite.shared | entry | flags
+        try:
+            for env in _envs(said.get("envs")):
+                below = _file(suite, said.get("config"), env)
+                own = {**suite.shared, **below, **entry, **flags}
+                jobs += _jobs(name, env, _seeds(said.get("seeds", 1)), own, runs)
+        except UsageError as error:
+            raise UsageError(f"{suite.name}, entry {name}: {error}") from None
+    return sorted(jobs, key=lambda job: job.config.run.seed)
+
+
+def _jobs(name: str, env: str, seeds: list[int], said: Settings, runs: str | Path) -> Iterable[Job]:
+    own = {key: value for key, value in said.items() if key not in ("envs", "seeds", "config")}
+    algorithm = own.pop("algorithm", name)
+    for key in DECIDED:
+        if key in own:
+            raise UsageError(f"{key}: is for the entry's name, envs and seeds to say")
+    run, hyper = settle(algorithm, env, own, {"name": name})
+    usual = settle(algorithm, env).settings()
+    differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
+    for seed in seeds:
+        config = Config(replace(run, seed=seed), hyper)
+        words = ["train", algorithm, env, f"--seed={seed}", *_flags(differing), f"--runs={runs}"]
+        yield Job(config, RunDirectory.of(runs, config), words)
+
+
+def _flags(settings: Settings) -> Iterable[str]:
+    """Settings as `train` takes them from a command line."""
+    for key, value in settings.items():
+        flag = key.replace("_", "-")
+        if key == "env_kwargs":
+            yield from (f"--env.{name}={json.dumps(each)}" for name, each in value.items())
+        elif isinstance(value, bool):
+            yield f"--{flag}" if value else f"--no-{flag}"
+        elif isinstance(value, (tuple, list)):
+            yield from (f"--{flag}", *map(str, value))
+        elif value is None:
+            raise UsageError(f"{key}: cannot be taken back to none")
+        else:
+            yield f"--{flag}={value}"
+
+
+def _envs(value: Any) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value) or not value:
+        raise UsageError("envs: must be a list of env ids, such as --envs Ant-v5 Walker2d-v5")
+    return list(dict.fromkeys(value))
+
+
+def _seeds(value: Any) -> list[int]:
+    seeds = list(range(min(value, MOST_SEEDS))) if type(value) is int else value
+    whole = isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
+    if not whole or not seeds:
+        raise UsageError(f"seeds: must be how many, or a list of them, got {value!r}")
+    if not all(0 <= seed < TUNING_SEEDS for seed in seeds):
+        raise UsageError(f"seeds: must be from 0 to {TUNING_SEEDS - 1}; above are those of `tune`")
+    return list(dict.fromkeys(seeds))
+
+
+def _file(suite: Suite, file: Any, env: str) -> Settings:
+    """Settings from an entry's config file, whose name may hold {env}."""
+    if file is None:
+        return {}
+    if not isinstance(file, str):
+        raise UsageError(f"config: must be the path of a file, it is {file!r}")
+    table = read_file(suite.folder / file.replace("{env}", env.replace("/", "-")))
+    return {key: value for key, value in table.items() if key not in DECIDED}
+
+
+def _plain(table: Settings) -> Settings:
+    return {key.replace("-", "_"): value for key, value in table.items()}
