@@ -12,6 +12,7 @@ from pacesetter import nets
 from pacesetter.policy import Floats, Layers, forward
 
 OU_PULL = 0.15
+SPARSE_CHANCE = 0.05
 ADAPT_EVERY = 50  # updates of a learner between two adaptations of its parameter noise
 ADAPT_FACTOR = 1.01
 SIGMA_RANGE = (1e-4, 1.0)  # where tanh saturates, distance no longer tells of sigma
@@ -26,7 +27,7 @@ def _fits_all_layers(kind: str, info: ValidationInfo) -> str:
     return kind
 
 
-Kind = Annotated[Literal["gaussian", "ou", "parameter"], AfterValidator(_fits_all_layers)]
+Kind = Annotated[Literal["gaussian", "ou", "sparse", "parameter"], AfterValidator(_fits_all_layers)]
 
 
 class Exploration(NamedTuple):
@@ -56,6 +57,14 @@ def _ou(
     return np.tanh(forward(actor, observation)) + moved, moved
 
 
+def _sparse(
+    actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
+) -> tuple[Floats, Any]:
+    before = forward(actor, observation)
+    noise = np.float32(scale) * rng.standard_normal(before.shape, np.float32)
+    return np.tanh(before + noise * (rng.random(before.shape) < SPARSE_CHANCE)), memory
+
+
 def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:
     actor, sigma = acting
 
@@ -78,6 +87,8 @@ KINDS = {
     "gaussian": Exploration(lambda acting, size, rng: (), _gaussian),
     # Ornstein-Uhlenbeck with theta 0.15 and unit time step (Lillicrap et al. 2016, section 7).
     "ou": Exploration(lambda acting, size, rng: np.zeros(size, np.float32), _ou),
+    # STEVE (Buckman et al. 2018): noise before the tanh, on each number with a chance of 5%.
+    "sparse": Exploration(lambda acting, size, rng: (), _sparse),
     # Plappert et al. 2018: one actor with noisy weights acts a whole episode, without other noise.
     "parameter": Exploration(_noisy_actor, _by_noisy_actor),
 }

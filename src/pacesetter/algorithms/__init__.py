@@ -26,6 +26,8 @@ TABLE = {
         "pacesetter.algorithms.sunrise", "an ensemble of SAC learners (Lee et al. 2021)"
     ),
     "sunrise-td3": Entry("pacesetter.algorithms.sunrise_td3", "SUNRISE's ensemble over TD3"),
+    "steve": Entry("pacesetter.algorithms.steve", "DDPG with targets from learned models"),
+    "steve-td3": Entry("pacesetter.algorithms.steve_td3", "TD3 with targets from learned models"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
     "trpo": Entry(
         "pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy", True

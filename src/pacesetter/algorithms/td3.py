@@ -72,13 +72,14 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class TD3:
-    """The learner of one member; `action_layer`, decay and output bound are DDPG's to set."""
+    """The learner of one member; what follows `hyper` is for DDPG and STEVE to set."""
 
     spec: Spec
     hyper: Hyper
     action_layer: int = 0
     critic_decay: float = 0.0
     output_bound: float | None = None
+    climbed: tuple[int, ...] = (0,)
 
     @cached_property
     def head(self) -> heads.Head:
@@ -191,13 +192,11 @@ class TD3:
     def fit_actor(
         self, state: State, batch: Batch, weight: Array | float = 1.0
     ) -> tuple[State, Array]:
-        """One Adam step of the actor up critic 1, then one soft step of all targets."""
-        first = jax.tree.map(lambda x: x[0], state.critic)
+        """One Adam step of the actor up what it climbs, then one soft step of all targets."""
 
         def loss(actor: nets.Network) -> Array:
             action = nets.actor(actor, batch.observation)
-            said = nets.outputs(first, batch.observation, action, self.action_layer)
-            return -(weight * self.head.value(said)).mean()
+            return -(weight * self.climbed_value(state.critic, batch.observation, action)).mean()
 
         value, gradient = jax.value_and_grad(loss)(state.actor)
         actor, optimizer = nets.descend(
@@ -222,6 +221,13 @@ class TD3:
             state.sigma,
         )
         return state._replace(sigma=sigma)
+
+    def climbed_value(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+        """The mean value (B,) by the critics that the actor climbs, in TD3 the first alone."""
+        ones = [jax.tree.map(lambda x, i=i: x[i], critic) for i in self.climbed]
+        said = [nets.outputs(one, observation, action, self.action_layer) for one in ones]
+        values = [self.head.value(each) for each in said]
+        return sum(values[1:], values[0]) / len(values)
 
     def _new_actor(self, key: Array) -> nets.Network:
         sizes = (self.spec.observation_size, self.hyper.hidden, self.spec.action_size)

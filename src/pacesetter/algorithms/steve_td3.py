@@ -1,0 +1,28 @@
+"""STEVE over TD3: targets from the minimum of twins and a smoothed target action at every horizon.
+
+Not in the paper, but what a fair test against TD3 needs: with horizon 0 and one member it is TD3.
+The actor climbs the mean of the first twins.
+"""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+from pydantic.dataclasses import dataclass as settings
+
+from pacesetter.algorithm import Spec
+from pacesetter.algorithms import steve
+from pacesetter.config import STRICT
+
+
+@settings(frozen=True, kw_only=True, config=STRICT)
+class Hyper(steve.Expansion):
+    """TD3's settings and the expansion's."""
+
+    critic_members: Annotated[int, AfterValidator(steve.can_disagree)] = Field(
+        2, ge=1, description="pairs of critics that give the target its variance"
+    )
+
+
+def build(spec: Spec, hyper: Hyper) -> steve.STEVE:
+    """The learner of one member."""
+    return steve.over(spec, hyper)
