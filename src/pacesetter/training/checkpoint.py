@@ -132,7 +132,7 @@ def _enter_episodes(
             ensemble.abandon(index)
 
 
-def _kept(ensemble: Ensemble, abouts: list[Any], arrays: Arrays) -> list[Policy | None]:
+def _kept(ensemble: Learning, abouts: list[Any], arrays: Arrays) -> list[Policy | None]:
     kept: list[Policy | None] = []
     for index, about in enumerate(abouts):
         policy = None

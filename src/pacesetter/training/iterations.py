@@ -20,6 +20,7 @@ from pacesetter.errors import TrainingError
 from pacesetter.policy import Floats, Policy, clip, normalize, unstack
 from pacesetter.seeding import Stream, generator
 from pacesetter.training.ensemble import blame
+from pacesetter.training.n_step import Pending
 from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Population
 from pacesetter.training.progress import Progress
@@ -48,6 +49,8 @@ class Iterations:
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps
         self.replays: list[Replay] = []
+        self.pending: list[Pending] = []
+        self.kept: list[Policy | None] = [None]  # nothing is assessed
         self.memory = [self.algorithm.begin(self.acting[0], rng) for rng in self.streams]
         self.progress = Progress.of(len(envs))
 
@@ -85,6 +88,12 @@ class Iterations:
         statistics = self.statistics if self.population.normalize else None
         layers = unstack(actors)
         return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
+
+    current = policy
+
+    def abandon(self, k: int) -> None:
+        """Begin a new episode in an env whose own cannot be repeated."""
+        self.progress.members[k].abandon()
 
     # Collect.
 

@@ -247,8 +247,8 @@ class ByReturn:
             kept = rng.random(2 * count) < priority
             found = np.concatenate([found, numbers[kept]])
             priorities = np.concatenate([priorities, priority[kept]])
-        numbers, priority = (x[:count].reshape(shape) for x in (found, priorities))
-        return Drawn(numbers, weigh(priority, self.importance, done))
+        weight = weigh(priorities[:count].reshape(shape), self.importance, done)
+        return Drawn(found[:count].reshape(shape), weight)
 
     def priority(self, numbers: Numbers) -> Reals:
         """Priorities of rows, as shares of the largest that there can be."""
