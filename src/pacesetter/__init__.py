@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pacesetter.evaluation import evaluate
     from pacesetter.policy import load
+    from pacesetter.study.comparison import compare
     from pacesetter.training.trainer import Trainer
 
-__all__ = ["Trainer", "evaluate", "load"]
+__all__ = ["Trainer", "compare", "evaluate", "load"]
 _HOMES = {
     "Trainer": "pacesetter.training.trainer",
     "evaluate": "pacesetter.evaluation",
     "load": "pacesetter.policy",
+    "compare": "pacesetter.study.comparison",
 }
 
 

@@ -8,7 +8,7 @@ from pacesetter.study import lineage, stats
 from pacesetter.study.comparison import METRICS, Comparison, Group, split
 from pacesetter.study.published import scale
 from pacesetter.study.stats import FEWEST_SEEDS, Array, Interval
-from pacesetter.study.tables import Cell, Table, interval, number, spread, steps, word
+from pacesetter.study.tables import Cell, Table, count, interval, number, spread, steps, word
 
 LEVELS = (1_000, 2_000)
 EFFECTS = (0.1, 0.2, 0.3)
@@ -225,7 +225,7 @@ def best_of_two(comparison: Comparison) -> list[Table]:
         halves = stats.best_of_two(half.values(comparison.metric)) if enough else Interval(np.nan)
         both = stats.best_of_two(control.values(comparison.metric))
         cells = [interval(found, after=f" ({split(env)[1]})") for found in (one, halves, both)]
-        rows.append([word(env), number(len(control.runs)), word(steps(budget)), *cells])
+        rows.append([word(env), number(len(control.runs)), count(budget), *cells])
         used.append(control)
     if not rows:
         return []

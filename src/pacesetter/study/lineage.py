@@ -84,7 +84,7 @@ def shorten(line: list[int], most: int = 12) -> str:
     return " ".join(words if len(words) <= most else ["...", *words[-most:]])
 
 
-def diagram(found: Selections, width: int = 3, height: int = 14) -> tuple[str, str, int, int]:
+def diagram(found: Selections, width: int = 3, height: int = 22) -> tuple[str, str, int, int]:
     """SVG paths of all copies and of the champion's line, and the size they need.
 
     Time goes right, one selection after another; each member has a height of its own.

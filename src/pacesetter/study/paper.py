@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from pacesetter.study import stats
 from pacesetter.study.comparison import METRICS, Comparison, Group, split
 from pacesetter.study.contents import about, ledger
 from pacesetter.study.published import Source, sources
-from pacesetter.study.tables import Cell, Table, number, spread, steps, word
+from pacesetter.study.tables import Cell, Table, count, number, spread, steps, word
 
 TASKS = ("Ant", "HalfCheetah", "Walker2d")  # the paper's, in the order of its tables
 PAPER = {"I": ("multi-td3", "sunrise"), "II": ("multi-td3", "td3")}
@@ -94,9 +96,10 @@ def published(comparison: Comparison) -> Table | None:
         if any(task in source["returns"] for source in sources()):
             values = group.values(comparison.metric)
             mean = spread(float(values.mean()), stats.deviation(values), f" ({version})")
-            budget = " and ".join(steps(count) for count in group.budgets)
+            alike = len(group.budgets) == 1
+            budget = count(group.budgets[0]) if alike else word("mixed")
             row = [word(task), word(group.name), mean, word(f"{comparison.metric}, seeds")]
-            rows.append([*row, number(len(values)), word(budget), word("ours")])
+            rows.append([*row, number(len(values)), budget, word("ours")])
             used.append(group)
     for task in dict.fromkeys(split(group.env)[0] for group in used):
         rows += [row for source in sources() for row in _rows(source, task, comparison.budget)]
@@ -134,7 +137,7 @@ def _rows(source: Source, task: str, budget: int | None) -> Iterator[list[Cell]]
         word(source["algorithm"]),
         _spread(values, f" ({source['version']})"),
         word(f"{source['metric']}{over}"),
-        word(source.get("seeds", "-")),
-        word(steps(at)),
+        number(source.get("seeds", np.nan)),
+        count(at),
         word(source["cite"]),
     ]

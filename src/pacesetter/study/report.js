@@ -22,7 +22,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
   }));
 }
 for (const cell of document.querySelectorAll("td")) {
-  if (cell.textContent.length > 60) cell.classList.add("long");
+  if (cell.textContent.length > 25 && !cell.querySelector("small")) cell.classList.add("long");
 }
 
 // Charts.
@@ -179,7 +179,7 @@ class Chart {
     element("line", { class: "cursor", x1: x, x2: x, y1: TOP, y2: HEIGHT - BOTTOM }, this.cursor);
     element("span", {}, this.values, `${this.spec.axes[this.axis].split(":")[0]} ${short(this.at)}`);
     for (const [name, [xs, mean, low, high]] of this.lines) {
-      if (this.at < xs[0] || this.at > xs[xs.length - 1]) continue;
+      if (xs.length < 2 || this.at < xs[0] || this.at > xs[xs.length - 1]) continue;
       const next = Math.max(1, xs.findIndex((value) => value >= this.at));
       const part = (this.at - xs[next - 1]) / (xs[next] - xs[next - 1]);
       const mix = (ys) => (ys[next] === null ? null : ys[next - 1] + part * (ys[next] - ys[next - 1]));

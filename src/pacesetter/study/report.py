@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 import shlex
 import sys
 from collections.abc import Iterable
@@ -57,6 +58,7 @@ def report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    library.filters["small_print"] = _small_print
     first, *rest = tables
     drawn = figure_2(comparison, window)
     return library.get_template("report.html.jinja").render(
@@ -76,6 +78,12 @@ def report(
         style=Markup((HERE / "report.css").read_text()),
         script=Markup((HERE / "report.js").read_text()),
     )
+
+
+def _small_print(text: str) -> tuple[str, str]:
+    """A cell's main words, and its interval and remarks, which go below."""
+    found = re.search(r" [\[(]", text)
+    return (text[: found.start()], text[found.start() + 1 :]) if found else (text, "")
 
 
 def _embed(table: Any) -> Markup:

@@ -122,6 +122,11 @@ def _fit(tabular: str) -> str:
     )
 
 
+def count(value: float) -> Cell:
+    """A cell of a number of env steps."""
+    return Cell(steps(value), value)
+
+
 def escape(text: str) -> str:
     """Words as LaTeX."""
     escaped = "".join(LATEX_ESCAPE_RULES.get(letter, letter) for letter in text)
