@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 
 from pacesetter.runs import find_all
-from pacesetter.study import contents, tables
+from pacesetter.study import contents, contrasts, tables
 from pacesetter.study.comparison import compare
 from pacesetter.study.figures import pdf
 from pacesetter.study.results import compact
@@ -38,10 +38,10 @@ def main() -> None:
         collect(found.collect)
     for budget in POINTS:
         there = compare([FILE], budget=budget)
-        shown = [contents.details(there), contents.speed(there), *contents.against(there)]
+        shown = [contents.details(there), contents.speed(there), *contrasts.against(there)]
         print(tables.markdown(f"{budget:,} env steps", there.notes, shown))
     everything = compare([FILE], mixed=True)
-    print(tables.markdown("Selections", everything.notes, contents.selections(everything)))
+    print(tables.markdown("Selections", everything.notes, contrasts.selections(everything)))
     if found.figures:
         pdf(everything, Path(found.figures) / "curves.pdf")
 

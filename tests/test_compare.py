@@ -16,7 +16,7 @@ from compare import make_run
 from pacesetter.cli import main
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
-from pacesetter.study import contents, curves, lineage, paper, stats, tables
+from pacesetter.study import contents, contrasts, curves, lineage, output, paper, stats, tables
 from pacesetter.study.comparison import compare, split
 from pacesetter.study.published import sources
 from pacesetter.study.results import compact, gather
@@ -192,7 +192,7 @@ def test_tables_hold_the_statistics_of_the_rows(runs: Path) -> None:
     cell = contents.overview(found).rows[0][1]
     assert cell.text == f"{mean.value:,.0f} [{mean.low:,.0f}; {mean.high:,.0f}] (v5, n=5, 100k)"
     assert found.names == ["td3", "multi-td3", "sac"]
-    control = contents.against(found)[0].rows
+    control = contrasts.against(found)[0].rows
     assert [row[1].text for row in control] == ["multi-td3", "sac"] * 2
 
 
@@ -211,7 +211,7 @@ def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path
 
 def test_every_results_table_has_its_ledger_and_versions(runs: Path) -> None:
     found = compare([runs])
-    shown = contents.tables(found) + paper.tables(found)
+    shown = output.everything(found, output.Options(published=True))
     titles = [table.title for table in shown]
     assert titles == [
         "Final return",
@@ -258,7 +258,7 @@ def test_best_of_two_spends_what_it_says(runs: Path) -> None:
     found = compare([runs])
     group = found.find("Ant-v5", "td3")
     assert group is not None
-    row = contents.best_of_two(found)[0].rows[0]
+    row = contrasts.best_of_two(found)[0].rows[0]
     half = stats.best_of_two(group.cut(50_000).values("final"))
     whole = stats.best_of_two(group.values("final"))
     assert [cell.key for cell in row[-2:]] == [half.value, whole.value]
@@ -270,7 +270,9 @@ def test_results_of_a_file_equal_those_of_the_runs(runs: Path, tmp_path: Path) -
     lines = [compact(RunDirectory(path.parent)) for path in runs.rglob("config.json")]
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     a, b = compare([runs]), compare([file])
-    assert tables.plain(contents.tables(a)) == tables.plain(contents.tables(b))
+    assert tables.plain(output.everything(a, output.Options())) == tables.plain(
+        output.everything(b, output.Options())
+    )
     assert a.notes == b.notes
 
 
@@ -278,11 +280,11 @@ def test_scores_are_over_the_published_scale(runs: Path) -> None:
     found = compare([runs])
     group = found.find("Ant-v5", "td3")
     assert group is not None
-    scores = contents.shared(found)["td3"]
+    scores = contrasts.shared(found)["td3"]
     np.testing.assert_allclose(scores[0], group.values("final") / 4185)
     one = compare([runs / "Ant-v5"])
-    assert contents.shared(one) == {}
-    assert contents.together(one) == []
+    assert contrasts.shared(one) == {}
+    assert contrasts.together(one) == []
 
 
 # Lineages.

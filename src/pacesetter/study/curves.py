@@ -6,7 +6,7 @@ import numpy as np
 
 from pacesetter.study import stats
 from pacesetter.study.comparison import Comparison, Group
-from pacesetter.study.contents import shared
+from pacesetter.study.contrasts import shared
 from pacesetter.study.results import Run
 from pacesetter.study.stats import Array
 

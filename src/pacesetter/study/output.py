@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pacesetter.errors import UsageError
 from pacesetter.storage import write_atomically
-from pacesetter.study import contents, paper, tables
+from pacesetter.study import contents, contrasts, paper, tables
 from pacesetter.study.comparison import Comparison
 from pacesetter.study.stats import SMOOTHING_ORDER
 from pacesetter.study.tables import Table
@@ -41,7 +41,7 @@ def check(paths: list[str], options: Options) -> list[Path]:
 
 def text(comparison: Comparison, options: Options) -> str:
     """For a terminal: the table of the metric, what speaks against it, and on request the paper."""
-    shown = [contents.overview(comparison), *contents.against(comparison)]
+    shown = [contents.overview(comparison), *contrasts.against(comparison)]
     shown += paper.tables(comparison) if options.published else []
     return "\n\n".join([tables.plain(shown), *comparison.notes])
 
@@ -73,5 +73,9 @@ def _page(comparison: Comparison, suffix: str, options: Options) -> str:
 
 
 def everything(comparison: Comparison, options: Options) -> list[Table]:
-    """All tables but that of the single runs."""
-    return contents.tables(comparison) + (paper.tables(comparison) if options.published else [])
+    """All tables that these runs can fill, the one of the metric first, but that of single runs."""
+    found = [contents.overview(comparison), contents.details(comparison)]
+    found += [contents.speed(comparison), *contrasts.against(comparison)]
+    found += [*contrasts.together(comparison), *contrasts.best_of_two(comparison)]
+    found += contrasts.selections(comparison)
+    return found + (paper.tables(comparison) if options.published else [])

@@ -58,11 +58,11 @@ def report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    library.filters["small_print"] = _small_print
     first, *rest = tables
     drawn = figure_2(comparison, window)
     return library.get_template("report.html.jinja").render(
         title=contents.title(comparison),
+        small_print=_small_print,
         notes=comparison.notes,
         first=first,
         tables=rest,
