@@ -356,7 +356,8 @@ def test_every_preset_builds(name: str) -> None:
     learner = algorithms.find(run.algorithm).build(Spec(17, 6), hyper)
     state = jax.eval_shape(learner.init, jax.random.key(0))
     assert state.actor[0]["kernel"].shape == (17, hyper.hidden[0])
-    assert state.actor[-1]["kernel"].shape == (hyper.hidden[-1], 6)
+    outputs = 12 if run.algorithm in ("sac", "crossq") else 6  # means and log deviations
+    assert state.actor[-1]["kernel"].shape == (hyper.hidden[-1], outputs)
     assert run.members == (2 if "multi-" in name or name == "demo" else 1)
     table = config.presets()[name.removeprefix("multi-")]
     assert table["help"]

@@ -38,7 +38,10 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "ddpg": ("ddpg", {}),
     "sac": ("sac", NO_ENTROPY),
     "crossq": ("crossq", CROSSQ | {"renorm_after": 100}),
-    "crossq-batch-norm": ("crossq", CROSSQ | {"batch_size": 256}),
+    "crossq-batch-norm": (
+        "crossq",
+        CROSSQ | {"batch_size": 256, "critic_learning_rate": 1e-3, "steps": 3_000},
+    ),
     "layer-norm": ("td3", NORM),
     "quantiles": ("td3", {"quantiles": 25}),
     "sac-quantiles": ("sac", NO_ENTROPY | {"quantiles": 25}),
