@@ -201,17 +201,12 @@ class Sunrise:
             state, loss, error = fit_critic(state, minibatch, y, rows)
             return state, (loss.mean(), error.max(axis=0), deviation, weight)
 
-        def draw(key: Array) -> tuple[Array, Array]:
-            *steps, actor_key = jax.random.split(key, self.cycle + 1)
-            return jnp.stack(steps), actor_key
-
-        members = jax.random.split(key, self.hyper.ensemble)
-        keys, actor_keys = jax.vmap(draw, out_axes=(1, 0))(members)
+        keys = jax.random.split(key, (self.cycle + 1, self.hyper.ensemble))
         state, (losses, error, *backup) = jax.lax.scan(
-            critic_step, state, (batch, keys), unroll=min(self.cycle, UNROLLED)
+            critic_step, state, (batch, keys[:-1]), unroll=min(self.cycle, UNROLLED)
         )
         last = jax.tree.map(lambda x: x[-1], batch)
-        state, actor_losses = fit_actor(state, last, actor_keys, self.share(last.mask))
+        state, actor_losses = fit_actor(state, last, keys[-1], self.share(last.mask))
         found = {name: loss.mean() for name, loss in actor_losses.items()}
         return Update(state, {"critic_loss": losses.mean()} | found | report(*backup), error)
 
