@@ -298,6 +298,12 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--critic-decay 0.01 --output-bound 0.003 --critics 1 --policy-delay 1 --target-noise 0",
         {},
     ),
+    "sac": (
+        "--steps 300 --hidden 8 --batch-size 8 --warmup 50 --replay return --replay-exponent 0.5 "
+        "--replay-importance 0.3 --replay-horizon 1000 --replay-to-go --n-step 3 --assess 2 "
+        "--assess-after 100 --update-every 4",
+        {},
+    ),
     "crossq": (
         "--steps 200 --hidden 8 --critic-hidden 8 6 --batch-size 8 --warmup 50 --critics 3 "
         "--policy-delay 2 --adam-momentum 0.9 --renorm-after 20 --alpha-learning-rate 1e-2 "
@@ -355,9 +361,9 @@ def test_every_preset_builds(name: str) -> None:
     run, hyper = settle(name, "HalfCheetah-v5")
     learner = algorithms.find(run.algorithm).build(Spec(17, 6), hyper)
     state = jax.eval_shape(learner.init, jax.random.key(0))
-    assert state.actor[0]["kernel"].shape == (17, hyper.hidden[0])
-    outputs = 12 if run.algorithm in ("sac", "crossq") else 6  # means and log deviations
-    assert state.actor[-1]["kernel"].shape == (hyper.hidden[-1], outputs)
+    assert state.actor[0]["kernel"].shape[-2:] == (17, hyper.hidden[0])
+    outputs = 12 if run.algorithm in ("sac", "crossq", "sunrise") else 6  # means and log deviations
+    assert state.actor[-1]["kernel"].shape[-2:] == (hyper.hidden[-1], outputs)
     assert run.members == (2 if "multi-" in name or name == "demo" else 1)
     table = config.presets()[name.removeprefix("multi-")]
     assert table["help"]
