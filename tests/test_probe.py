@@ -29,19 +29,21 @@ NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can s
     "alpha_learning_rate": 1e-6,
     "exploration_noise": None,
 }
-CROSSQ = NO_ENTROPY | {"critic_hidden": (64, 64), "tau": None, "steps": 2_000}
 FEW = {"ensemble": 3}
+# Before renorm, values by the running statistics are not yet those of the batches that it learns.
+CROSSQ = NO_ENTROPY | {
+    "critic_hidden": (64, 64),
+    "tau": None,
+    "steps": 2_000,
+    "renorm_after": 100,
+}
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": ("td3", {}),
     "ddpg": ("ddpg", {}),
     "sac": ("sac", NO_ENTROPY),
-    "crossq": ("crossq", CROSSQ | {"renorm_after": 100}),
-    "crossq-batch-norm": (
-        "crossq",
-        CROSSQ | {"batch_size": 256, "critic_learning_rate": 1e-3, "steps": 3_000},
-    ),
+    "crossq": ("crossq", CROSSQ),
     "layer-norm": ("td3", NORM),
     "quantiles": ("td3", {"quantiles": 25}),
     "sac-quantiles": ("sac", NO_ENTROPY | {"quantiles": 25}),
