@@ -245,7 +245,7 @@ def test_help_of_a_suite_has_the_settings_of_its_algorithms(
 
 # The loop, in this process.
 
-Action = int | Callable[[list[str]], int] | None
+Action = int | Callable[[list[str]], int | Outcome] | None
 
 
 class Here:
@@ -261,8 +261,9 @@ class Here:
         action = self.plan.pop(0) if self.plan else None
         if action is None:
             return Outcome(main(words), "")
-        code = action if isinstance(action, int) else action(words)
-        return Outcome(code, "a line\npacesetter: the fault\n")
+        result = action if isinstance(action, int) else action(words)
+        said = "a line\npacesetter: the fault\n"
+        return result if isinstance(result, Outcome) else Outcome(result, said)
 
     def poll(self, task: Outcome) -> Outcome:
         return task
@@ -333,7 +334,9 @@ def test_saved_run_is_resumed(jobs: list[Job], undisturbed: Path) -> None:
 def killed_at_birth(words: list[str]) -> int:
     """A run with its config written and nothing else."""
     config = parsed(words[:-1])
-    RunDirectory.of("runs", config).create(config)
+    directory = RunDirectory.of("runs", config)
+    directory.create(config)
+    directory.unlock()
     return -9
 
 
@@ -392,24 +395,22 @@ def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
     assert len(work.finished) == 2
 
 
-def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:
+def test_run_that_another_was_quicker_with(
+    jobs: list[Job], capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit 2 of a command that met another process's run is no failure."""
 
     def overtaken(words: list[str]) -> int:
         stop_at(200)(words)
         return main(words)
 
-    def in_use(words: list[str]) -> int:
+    def in_use(words: list[str]) -> Outcome:
         jobs[0].directory.lock()
         assert main(words) == 2
-        holders.append(jobs[0].directory)
-        return 2
+        jobs[0].directory.unlock()
+        return Outcome(2, capsys.readouterr().err)
 
-    holders: list[RunDirectory] = []
-    work = Bench(jobs[:1])
-    for _ in work.run(executor := Here(overtaken, in_use)):
-        if holders:
-            holders.pop().unlock()
+    work = run(jobs[:1], executor := Here(overtaken, in_use))
     assert executor.calls == ["train", "resume", "resume"]
     assert (work.finished, work.failed) == (jobs[:1], {})
 
@@ -712,7 +713,7 @@ def test_ray_cluster(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
         cluster.add_node(num_cpus=1)
         executor = Ray(None, cluster.address)
         assert executor.slots == 2
-        long = {"steps": 10**6, "eval_every": 10**6, "warmup": 10**6, "replay_size": 1000}
+        long = {"steps": 10**8, "eval_every": 10**6, "warmup": 10**6, "replay_size": 1000}
         endless = expand(load("suite.toml"), long, "long")
         work = Bench(endless)
         logs = [job.directory.metrics_file for job in endless]
@@ -725,8 +726,8 @@ def test_ray_cluster(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
                 killed = True
             if "trying again" in "".join(work.news) and endless[0].directory.in_use():
                 work.stop()
-        assert [job.directory.in_use() for job in endless] == [False, False]
-        assert sum("stopped" in line for line in work.news) == 2
+        assert [job.directory.in_use() for job in endless] == [False, False], work.news
+        assert sum("stopped" in line for line in work.news) == 2, work.news
         for job in endless:
             trainer = Trainer.resume(job.directory.path)
             assert trainer.progress.step > 0

@@ -232,3 +232,18 @@ def test_a_page_without_a_film_says_why_in_one_line(
     lines = [compact(RunDirectory(config.parent)) for config in run.rglob("config.json")]
     file.write_text("".join(json.dumps(line) + os.linesep for line in lines))
     assert "no film, since results hold no policy" in write(tmp_path / "b.html", file)
+
+
+def test_one_short_run_without_an_update_is_drawn(browser: Any, tmp_path: Path) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    run = make_run(tmp_path / "runs", budget=20_000, evaluations=10)
+    write(tmp_path / "report.html", run, "--no-film")
+    browser.get((tmp_path / "report.html").as_uri())
+    for axis in browser.find_elements("css selector", "#axes input"):
+        axis.click()
+        chart = browser.find_element("css selector", ".chart svg")
+        browser.execute_script("arguments[0].focus()", chart)
+        chart.send_keys(Keys.ARROW_RIGHT)
+        assert "NaN" not in browser.find_element("css selector", ".chart").get_property("outerHTML")
+    assert browser.get_log("browser") == []

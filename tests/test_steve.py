@@ -14,8 +14,9 @@ from conftest import TINY, run_to_end
 from pacesetter import algorithms
 from pacesetter.algorithm import Batch, Spec
 from pacesetter.algorithms.steve import STEVE, combine
+from pacesetter.algorithms.td3 import State
 from pacesetter.config import settle
-from pacesetter.dynamics import Dynamics, Known
+from pacesetter.dynamics import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.policy import forward
 from pacesetter.training.population import inherit
@@ -57,14 +58,29 @@ def rows(*shape: int, seed: int = 0) -> Batch:
     )
 
 
-def same(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
-
-
 def compiled(method: Callable[..., Any]) -> Callable[..., Any]:
     inner = jax.jit(method)
     return lambda *arguments: jax.device_get(inner(*arguments))
+
+
+def new(algorithm: Any, seed: int = 3) -> Any:
+    """A state of random networks and moments that have not moved: `init` takes long to compile."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(algorithm.init, KEY)
+    zero = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+
+    def draw(x: Any) -> Any:
+        return rng.normal(size=x.shape, scale=0.5).astype(x.dtype)
+
+    state = zero._replace(**{part: jax.tree.map(draw, getattr(zero, part)) for part in NETWORKS})
+    networks, scale = zero.models
+    scale = scale._replace(variance=scale.variance + 1)
+    return state._replace(models=Models(jax.tree.map(draw, networks), scale))
+
+
+def same(one: Any, other: Any) -> bool:
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 # Targets by hand.
@@ -147,7 +163,7 @@ def test_a_perfect_linear_model_gives_the_n_step_return() -> None:
     algorithm = learner("steve", gamma=gamma, horizon=horizon, batch_size=32, **SMALL)
     dynamics = Dynamics(SPEC, members=4, hidden=(), known=known)
     algorithm = replace(algorithm, dynamics=dynamics)
-    state = algorithm.init(KEY)
+    state = new(algorithm)
     layer = {"kernel": np.stack([change] * 4), "bias": np.zeros((4, 3), np.float32)}
     networks = state.models.networks._replace(change=(layer,))
     state = state._replace(models=state.models._replace(networks=networks))
@@ -185,8 +201,8 @@ def test_without_horizon_it_is_its_base(name: str, base: str) -> None:
     steve = learner(name, horizon=0, critic_members=1, batch_size=16, **SMALL)
     plain = learner(base, batch_size=16, hidden=SMALL["hidden"])  # acts otherwise, learns alike
     update, plain_update = compiled(steve.update), compiled(plain.update)
-    ours, theirs = jax.device_get((steve.init(KEY), plain.init(KEY)))
-    assert_equal_networks(ours, theirs)
+    ours = new(steve)
+    theirs = State(**{part: getattr(ours, part) for part in State._fields})
     for cycle in range(5):
         batch, key = rows(plain.cycle, 16, seed=cycle), jax.random.key(cycle)
         mine, other = update(ours, batch, key), plain_update(theirs, batch, key)
@@ -196,6 +212,7 @@ def test_without_horizon_it_is_its_base(name: str, base: str) -> None:
         assert mine.losses["model_use"] == 0
 
 
+@pytest.mark.slow
 def test_a_whole_run_without_horizon_is_td3(runs: Path) -> None:
     """Env, noise, replay and evaluation included."""
     settings = {**TINY, "steps": 400, "eval_every": 200}
@@ -203,7 +220,7 @@ def test_a_whole_run_without_horizon_is_td3(runs: Path) -> None:
     settings |= {"horizon": 0, "critic_members": 1, "model_hidden": (8,), "head_hidden": (6,)}
     steve = Trainer("steve-td3", "Hopper-v5", runs=runs, **settings)
     scores = [
-        [row["return"] for row in run_to_end(trainer).rows() if row["kind"] == "eval"]
+        [row["returns"] for row in run_to_end(trainer).rows() if row["kind"] == "eval"]
         for trainer in (steve, plain)
     ]
     assert scores[0] == scores[1]
@@ -214,10 +231,10 @@ def test_several_members_without_horizon_share_the_mean_target() -> None:
     """Each member is a pair of twins whose minimum counts; the actor climbs the first twins."""
     algorithm = learner("steve-td3", horizon=0, critic_members=3, batch_size=16, **SMALL)
     assert algorithm.base.climbed == (0, 2, 4)
-    state, batch = algorithm.init(KEY), rows(16)
+    state, batch = new(algorithm), rows(16)
     y, weight = compiled(algorithm.target)(state, batch, KEY)
-    action = algorithm.base.next_action(state, batch.next_observation, KEY)
-    values = algorithm.base.values(state.target_critic, batch.next_observation, action)
+    action = compiled(algorithm.base.next_action)(state, batch.next_observation, KEY)
+    values = compiled(algorithm.values)(state.target_critic, batch.next_observation, action)
     expected = np.asarray(values).reshape(3, 2, 16).min(axis=1).mean(axis=0)
     np.testing.assert_allclose(y, batch.reward + batch.discount * expected, atol=1e-6)
     assert np.all(weight == 1)
@@ -229,19 +246,18 @@ def test_several_members_without_horizon_share_the_mean_target() -> None:
 @pytest.fixture(scope="module")
 def steve() -> tuple[Any, Any, Callable[..., Any]]:
     algorithm = learner("steve", horizon=2, critic_members=2, models=3, batch_size=16, **SMALL)
-    return algorithm, jax.device_get(algorithm.init(KEY)), compiled(algorithm.update)
+    return algorithm, new(algorithm), compiled(algorithm.update)
 
 
-def test_each_model_and_critic_learns_from_rows_of_its_own(steve: Any) -> None:
+def test_each_model_and_critic_learns_from_rows_of_its_own(
+    steve: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Other rewards in row 1 change model 1 and critic 1 alone, once targets are given."""
     algorithm, state, _ = steve
     batch, other = rows(16), rows(16)
     other.reward[1] += 1
+    monkeypatch.setattr(Dynamics, "observe", lambda self, models, batch: models)  # is for all
     fit = compiled(algorithm.fit_models)
-    scale = compiled(algorithm.dynamics.observe)(state.models, batch).scale
-    frozen = replace(algorithm.dynamics)
-    object.__setattr__(frozen, "observe", lambda models, batch: models._replace(scale=scale))
-    fit = compiled(replace(algorithm, dynamics=frozen).fit_models)
     one, two = fit(state, batch)[0].models, fit(state, other)[0].models
     for index, moved in ((0, False), (1, True), (2, False)):
         networks = [jax.tree.map(lambda x, i=index: x[i], m.networks) for m in (one, two)]
@@ -262,6 +278,7 @@ def test_pairs_of_twins_share_their_rows() -> None:
     np.testing.assert_array_equal(algorithm.routes(4), expected)
 
 
+@pytest.mark.slow
 def test_model_use_is_what_horizon_0_does_not_get(steve: Any) -> None:
     """One minus its weight, which lies strictly between 0 and 1 as soon as both can vary."""
     algorithm, state, update = steve
@@ -300,10 +317,10 @@ def test_no_gradient_flows_through_the_target(steve: Any) -> None:
 def test_copies_of_members(copy: str) -> None:
     """Models go with the networks; `weights` leaves each its own moments, `actor` its models."""
     algorithm = learner("steve", batch_size=16, **SMALL)
-    update = compiled(algorithm.update)
-    states = [
-        update(algorithm.init(jax.random.key(i)), rows(1, 16, seed=i), KEY).state for i in (0, 1)
-    ]
+    states = [new(algorithm, seed) for seed in (0, 1)]
+    states[1] = states[1]._replace(
+        models_optimizer=jax.tree.map(lambda x: x + 1, states[1].models_optimizer)
+    )
     _, copied = inherit(states, np.array([0, 0]), copy)
     assert same(copied.actor, states[0].actor)
     assert same(copied.models, states[1 if copy == "actor" else 0].models)
@@ -311,12 +328,16 @@ def test_copies_of_members(copy: str) -> None:
     assert same(copied.models_optimizer, own)
 
 
-def test_no_key_is_used_twice_and_nothing_is_nan(runs: Path) -> None:
-    """JAX's checks pass, from an empty replay through selections of two members."""
+def test_no_key_is_used_twice() -> None:
     algorithm = learner("steve-td3", batch_size=16, **SMALL)
     with jax.debug_key_reuse(True):
-        jax.eval_shape(jax.jit(algorithm.init), KEY)
-        jax.eval_shape(jax.jit(algorithm.update), algorithm.init(KEY), rows(2, 16), KEY)
+        state = jax.eval_shape(jax.jit(algorithm.init), KEY)
+        jax.eval_shape(jax.jit(algorithm.update), state, rows(2, 16), KEY)
+
+
+@pytest.mark.slow
+def test_nothing_is_nan(runs: Path) -> None:
+    """A short run, from an empty replay through selections of two members."""
     settings = {**TINY, "warmup": 20, "steps": 80, "model_hidden": (8,), "head_hidden": (6,)}
     with jax.debug_nans(True):
         trainer = Trainer("multi-steve-td3", "probe_envs:Scripted-v0", runs=runs, **settings)
@@ -330,7 +351,7 @@ def test_no_key_is_used_twice_and_nothing_is_nan(runs: Path) -> None:
 def test_sparse_exploration_is_the_published_one() -> None:
     """Each number, with probability .05 and alone, gets normal noise before the tanh."""
     algorithm = learner("steve", **SMALL)
-    acting = jax.tree.map(np.array, algorithm.init(KEY).actor)
+    acting = new(algorithm).actor
     rng, observation = np.random.default_rng(1), np.float32([0.1, -0.2, 0.3])
     before = forward(acting, observation)
     actions = np.array([algorithm.act(acting, (), observation, rng)[0] for _ in range(20_000)])

@@ -61,8 +61,8 @@ def _sparse(
     actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
 ) -> tuple[Floats, Any]:
     before = forward(actor, observation)
-    noise = np.float32(scale) * rng.standard_normal(before.shape, np.float32)
-    return np.tanh(before + noise * (rng.random(before.shape) < SPARSE_CHANCE)), memory
+    chosen = rng.random(before.shape) < SPARSE_CHANCE
+    return np.tanh(before + _normal(before.shape, scale, rng) * chosen), memory
 
 
 def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:

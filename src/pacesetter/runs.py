@@ -21,6 +21,7 @@ from pacesetter.errors import UsageError
 from pacesetter.storage import TEMPORARY, write_atomically
 
 SCHEMA = 1
+IN_USE = "is in use by"
 PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 Row = dict[str, Any]
 
@@ -167,7 +168,7 @@ class RunDirectory:
             file.seek(0)
             holder = file.read(200).strip() or "another process"
             file.close()
-            raise UsageError(f"run: {self.path} is in use by {holder}") from None
+            raise UsageError(f"run: {self.path} {IN_USE} {holder}") from None
         file.truncate(0)
         file.write(f"process {os.getpid()} on {platform.node()}\n")
         file.flush()

@@ -23,6 +23,7 @@ from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import ddpg, td3
 from pacesetter.config import STRICT, Width
 from pacesetter.dynamics import Dynamics, Models
+from pacesetter.exploration import Kind
 from pacesetter.policy import Actors, Floats
 
 SMALLEST_VARIANCE = 1e-8  # as in the reference
@@ -69,7 +70,7 @@ class Expansion(td3.Hyper):
 class Hyper(ddpg.Hyper, Expansion):  # in this order, or the latter's defaults would count
     """DDPG's settings and the expansion's; exploration is the paper's."""
 
-    exploration: td3.Kind = Field("sparse", description="noise on actions, or on weights")
+    exploration: Kind = Field("sparse", description="noise on actions, or on weights")
     exploration_noise: float = Field(1.0, ge=0, description="deviation of that noise")
 
 

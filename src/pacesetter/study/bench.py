@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 from pacesetter import storage
 from pacesetter.errors import UsageError
+from pacesetter.runs import IN_USE
 from pacesetter.study.suite import Job
 from pacesetter.training.progress import Progress
 
@@ -162,7 +163,7 @@ class Bench:
             self.news.append(f"{job}: stopped")
         elif outcome.code in SAVED:
             self._waiting.append(job)
-        elif outcome.code == BAD_INPUT and (job.directory.in_use() or overtaken):
+        elif outcome.code == BAD_INPUT and (IN_USE in outcome.output or overtaken):
             self._waiting.append(job)  # another process has been quicker
         elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
             self._fail(job, words, outcome)

@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,7 +84,8 @@ def run_command(words: list[str], folder: str) -> tuple[int, str]:
     with tempfile.TemporaryFile() as output:
         process = _popen(words, output, folder)
         try:
-            process.wait()
+            while process.poll() is None:  # Ray cannot interrupt a wait
+                time.sleep(0.2)
         except KeyboardInterrupt:
             process.terminate()
             process.wait()

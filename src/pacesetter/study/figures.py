@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,22 @@ def pdf(comparison: Comparison, path: Path, window: int | None = None) -> None:
 
 
 def _figure(rows: int, columns: int) -> tuple[Any, Any]:
+    """Panels of a fixed size; margins in inches, since a layout engine draws everything twice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.2 * columns, 3.2 * rows + 0.6), layout="constrained")
+    width, height, wide, high = 3.4, 2.4, 0.85, 0.9
+    size = (columns * (width + wide) + 0.2, rows * (height + high) + 0.4)
+    figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
+    figure.subplots_adjust(
+        left=0.8 / size[0],
+        right=1 - 0.2 / size[0],
+        bottom=0.55 / size[1],
+        top=1 - 0.75 / size[1],
+        wspace=wide / width,
+        hspace=high / height,
+    )
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
@@ -57,7 +69,7 @@ def page(comparison: Comparison, axis: str, window: int | None = None) -> Any:
                 _draw(panel, curve(group, axis, window), styles[group.name], label)
         _label(panel, env, AXES[axis], "return")
         panel.legend(frameon=False, fontsize="small")
-    figure.suptitle(f"Mean over seeds and 95% t interval{_smoothed(window)}", fontsize="medium")
+    _head(figure, f"Mean over seeds and 95% t interval{_smoothed(window)}")
     return figure
 
 
@@ -69,7 +81,6 @@ def profile_page(comparison: Comparison) -> Any:
     label, lines = found
     styles = style(comparison.names)
     figure, panels = _figure(1, 1)
-    figure.set_size_inches(7, 4.5)
     for name, line in lines.items():
         _draw(panels[0, 0], line, styles[name], name)
     _label(panels[0, 0], "Performance profile", label, "share of runs above")
@@ -100,12 +111,16 @@ def figure_2(comparison: Comparison, window: int | None = None) -> Any:
             else:
                 panel.text(0.5, 0.5, "no runs", ha="center", transform=panel.transAxes)
                 panel.set(xticks=[], yticks=[], ylabel="")
-    figure.suptitle(
+    _head(
+        figure,
         "The paper's figure 2: return against env steps of all members, mean over seeds and 95% t "
         f"interval{_smoothed(window)}",
-        fontsize="medium",
     )
     return figure
+
+
+def _head(figure: Any, text: str) -> None:
+    figure.suptitle(fill(text, int(13 * figure.get_figwidth())), fontsize="small")
 
 
 def svg(figure: Any) -> str:

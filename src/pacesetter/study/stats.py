@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 from scipy import stats as scipy_stats
 
 Array = NDArray[np.float64]
@@ -56,10 +55,12 @@ def reached(steps: Array, returns: Array, level: float) -> float:
 
 def smooth(values: Array, window: int) -> Array:
     """Savitzky-Golay filter, for plots only: it looks ahead, and overshoots at jumps and ends."""
+    from scipy.signal import savgol_filter
+
     odd = min(window, len(values)) - (min(window, len(values)) + 1) % 2
     if odd <= SMOOTHING_ORDER:
         return values
-    return cast("Array", signal.savgol_filter(values, odd, SMOOTHING_ORDER))
+    return cast("Array", savgol_filter(values, odd, SMOOTHING_ORDER))
 
 
 # The runs of one group, (n,).
