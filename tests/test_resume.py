@@ -9,6 +9,7 @@ from conftest import TINY, assert_same, run_to_end
 from pacesetter.training import replay
 from pacesetter.training.trainer import Trainer
 
+MODELS = {"model_hidden": (8,), "head_hidden": (8,), "critic_members": 2}
 CASES = {
     "td3": {"env": "HalfCheetah-v5"},
     "multi-td3": {"env": "HalfCheetah-v5", "steps": 3_300},
@@ -82,6 +83,8 @@ CASES = {
         "assess_after": 200,
         "normalize_observation": True,
     },
+    "steve": {"env": "Hopper-v5", "algorithm": "multi-steve", "copy": "weights", **MODELS},
+    "steve-td3": {"env": "Hopper-v5", "algorithm": "multi-steve-td3", **MODELS},
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
 }
 
@@ -107,6 +110,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
 
 SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
 SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
+SLOW += ("steve", "steve-td3")
 
 
 @pytest.mark.parametrize(

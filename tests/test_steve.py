@@ -377,6 +377,9 @@ def test_settings_that_cannot_work_are_refused() -> None:
         ("steve-td3", {"critic_members": 1}, "critic_members: gives the models no weight"),
         ("steve", {"batch_size": 3, "critic_members": 2}, "models: is more than there are rows"),
         ("steve-td3", {"quantiles": 25}, "quantiles: is fixed"),
+        ("steve", {"quantiles": 25}, "quantiles: is fixed"),
+        ("steve", {"n_step": 3}, "n_step: is fixed"),
+        ("steve-td3", {"n_step": 3}, "n_step: is fixed"),
         ("steve", {"policy_delay": 2}, "policy_delay: is fixed"),
     ):
         with pytest.raises(UsageError, match=message):

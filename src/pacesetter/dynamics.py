@@ -106,7 +106,7 @@ class Dynamics:
     spec: Spec
     members: int = 4
     hidden: tuple[int, ...] = (256, 256)
-    head_hidden: tuple[int, ...] = (128, 128)
+    head_hidden: tuple[int, ...] = (64, 64)
     form: Form = DETERMINISTIC
     known: Known | None = None
     learning_rate: float = 1e-3

@@ -45,29 +45,36 @@ def can_disagree(count: int, info: ValidationInfo) -> int:
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Expansion(td3.Hyper):
-    """What STEVE adds; networks are smaller than the published ones (preset steve-published)."""
+class Expansion:
+    """What STEVE adds to its base, or fixes; sizes are below the published ones (steve-paper)."""
 
     horizon: int = Field(3, ge=0, le=20, description="longest imagined way; 0 is no model at all")
     critic_members: Annotated[int, AfterValidator(can_disagree)] = Field(
-        4, ge=1, description="critics that give the target its variance; each learns own rows"
+        4,
+        ge=1,
+        validate_default=True,
+        description="critics that give the target its variance; each learns own rows",
     )
     models: Annotated[int, AfterValidator(has_rows)] = Field(
-        4, ge=1, description="models, and reward heads; each learns own rows"
+        4,
+        ge=1,
+        validate_default=True,
+        description="models, and reward heads; each learns own rows",
     )
     model_hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of a model's hidden layers"
     )
     head_hidden: tuple[Width, ...] = Field(
-        (128, 128), min_length=1, description="widths in the heads for reward and termination"
+        (64, 64), min_length=1, description="widths in the heads for reward and termination"
     )
     model_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the models")
     model_decay: float = Field(0.0, ge=0, description="L2 added to the models' gradient")
     quantiles: Annotated[int, ddpg.only(0)] = Field(0, description="fixed: variances are of means")
+    n_step: Annotated[int, ddpg.only(1)] = Field(1, description="fixed: models learn single steps")
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Hyper(ddpg.Hyper, Expansion):  # in this order, or the latter's defaults would count
+class Hyper(Expansion, ddpg.Hyper):
     """DDPG's settings and the expansion's; exploration is the paper's."""
 
     exploration: Kind = Field("sparse", description="noise on actions, or on weights")
@@ -95,7 +102,7 @@ class STEVE:
 
     base: Any
     dynamics: Dynamics
-    hyper: Expansion
+    hyper: Any
 
     @property
     def cycle(self) -> int:
@@ -181,8 +188,12 @@ class STEVE:
     def ask(self, state: State, observation: Array, key: Array) -> tuple[Array, Array]:
         """The target action (B, A) and what it is worth to each critic member (L, B)."""
         action = self.base.next_action(state, observation, key)
-        values = self.base.values(state.target_critic, observation, action)
+        values = self.values(state.target_critic, observation, action)
         return action, values.reshape(-1, self.hyper.critics, len(observation)).min(axis=1)
+
+    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+        """Every critic's value (critics, B)."""
+        return self.base.values(critic, observation, action)
 
     def routes(self, rows: int) -> Array:
         """1 where a critic learns from a row, (critics, B); a minibatch has them in any order."""
@@ -208,6 +219,8 @@ class STEVE:
 def combine(candidates: Sequence[Array]) -> tuple[Array, Array]:
     """Targets (B,) and weights (H + 1, B) from the candidates (estimates, B) of each horizon."""
     mean = jnp.stack([each.mean(axis=0) for each in candidates])
+    if len(mean) == 1:  # nothing to weigh, so that not even a last bit changes
+        return mean[0], jnp.ones_like(mean)
     variance = jnp.stack([each.var(axis=0) for each in candidates])
     weight = 1 / (variance + SMALLEST_VARIANCE)
     weight = weight / weight.sum(axis=0)
@@ -219,7 +232,7 @@ def build(spec: Spec, hyper: Hyper) -> STEVE:
     return over(spec, hyper, hyper.action_layer, hyper.critic_decay, hyper.output_bound)
 
 
-def over(spec: Spec, hyper: Expansion, *more: Any) -> STEVE:
+def over(spec: Spec, hyper: Any, *more: Any) -> STEVE:
     """STEVE over a TD3 with as many critics as its members have together."""
     table = {field.name: getattr(hyper, field.name) for field in fields(td3.Hyper)}
     table["critics"] = hyper.critics * hyper.critic_members

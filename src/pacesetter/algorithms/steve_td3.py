@@ -10,16 +10,19 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import Spec
-from pacesetter.algorithms import steve
+from pacesetter.algorithms import steve, td3
 from pacesetter.config import STRICT
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Hyper(steve.Expansion):
+class Hyper(steve.Expansion, td3.Hyper):
     """TD3's settings and the expansion's."""
 
     critic_members: Annotated[int, AfterValidator(steve.can_disagree)] = Field(
-        2, ge=1, description="pairs of critics that give the target its variance"
+        2,
+        ge=1,
+        validate_default=True,
+        description="pairs of critics that give the target its variance",
     )
 
 

@@ -95,6 +95,7 @@ class Bench:
         self.news: list[str] = []
         self._waiting = deque(job for job, over in zip(jobs, done, strict=True) if not over)
         self._failures: Counter[str] = Counter()
+        self._aside: set[str] = set()
         self._stopping = False
 
     def stop(self) -> None:
@@ -139,7 +140,7 @@ class Bench:
             for _ in range(len(self._waiting)):
                 job = self._waiting.popleft()
                 if job.directory.in_use():  # by another bench, or left by one that was killed
-                    self._waiting.append(job)
+                    self._set_aside(job)
                 elif is_finished(job):
                     self._finish(job)
                 else:
@@ -164,13 +165,19 @@ class Bench:
         elif outcome.code in SAVED:
             self._waiting.append(job)
         elif outcome.code == BAD_INPUT and (IN_USE in outcome.output or overtaken):
-            self._waiting.append(job)  # another process has been quicker
+            self._set_aside(job)
         elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
             self._fail(job, words, outcome)
         else:
             self._failures[str(job)] += 1
             self._waiting.append(job)
             self.news.append(f"{job}: failed, {_last_line(outcome)}; trying again")
+
+    def _set_aside(self, job: Job) -> None:
+        self._waiting.append(job)
+        if str(job) not in self._aside:
+            self._aside.add(str(job))
+            self.news.append(f"{job}: another process has it; looked at again when it is free")
 
     def _finish(self, job: Job) -> None:
         self.finished.append(job)
