@@ -600,7 +600,9 @@ def test_interrupted_bench_saves_all_and_goes_on(jobs: list[Job]) -> None:
         assert record["threads"] == 1
         assert record["machine"].endswith(", 1 cores")
         trainer = Trainer.resume(job.directory.path)  # it starts where the signal came
-        assert (trainer.notes, 0 < trainer.progress.step < 1_000_000) == ([], True)
+        # Nothing was lost; this process may only have other threads than the run.
+        assert all("threads" in note for note in trainer.notes)
+        assert 0 < trainer.progress.step < 1_000_000
         assert trainer.progress.step >= job.directory.rows()[-1]["step"]
         trainer.close()
 

@@ -161,7 +161,7 @@ def test_a_fall_is_the_end_of_the_task(algorithm: str, runs: Path) -> None:
 
 # Other rows, drawn otherwise.
 
-KINDS: dict[str, dict[str, Any]] = {
+DRAWS: dict[str, dict[str, Any]] = {
     "prioritized": {"replay": "prioritized"},
     "lap": {"replay": "lap"},
     "return": {"replay": "return"},
@@ -169,10 +169,10 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DRAWS)
 def test_every_replay_learns_the_same(kind: str, runs: Path) -> None:
     """How rows are drawn moves no fixed point: reward -4 (a - s/2)^2 for s = -1 or 1."""
-    trainer = learn("td3", "BothReward-v0", runs, KINDS[kind])
+    trainer = learn("td3", "BothReward-v0", runs, DRAWS[kind])
     near(trainer.policy()(np.array([[-1], [1]])), [[-0.5], [0.5]])
     near(values(trainer, -1, [-0.5]), 0)
     near(values(trainer, 1, [0.5]), 0)

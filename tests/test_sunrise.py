@@ -23,6 +23,15 @@ KEY = jax.random.key(3)
 BASES = {"sunrise": "sac", "sunrise-td3": "td3"}
 both = pytest.mark.parametrize("name", BASES)
 forms = pytest.mark.parametrize("reference", sunrise.FORMS)
+pairs = pytest.mark.parametrize(
+    ("name", "reference"),
+    [
+        ("sunrise", "paper"),
+        ("sunrise-td3", "official"),
+        pytest.param("sunrise", "official", marks=pytest.mark.slow),
+        pytest.param("sunrise-td3", "paper", marks=pytest.mark.slow),
+    ],
+)
 _jit = partial(jax.jit, static_argnums=0)
 init = _jit(lambda learner, key: learner.init(key))
 update = _jit(lambda learner, *arguments: learner.update(*arguments))
@@ -37,7 +46,7 @@ def _keep_compiled() -> None:
 
 def learner(name: str, spec: Spec = SPEC, **hyper: Any) -> Any:
     kind = algorithms.find(name)
-    return kind.build(spec, kind.Hyper(**{"hidden": (12, 10), **hyper}))
+    return kind.build(spec, kind.Hyper(**{"hidden": (8,), **hyper}))
 
 
 def begin(algorithm: Any, key: Any = KEY) -> Any:
@@ -149,8 +158,7 @@ def firsts(optimizer: Any) -> list[Any]:
 # Masks.
 
 
-@both
-@forms
+@pairs
 def test_a_learner_without_rows_stands_still(name: str, reference: Any) -> None:
     """Its gradients are exactly 0, of critics, actor and temperature; nothing is NaN."""
     ours = learner(name, ensemble=3, reference=reference)
@@ -171,8 +179,7 @@ def test_a_learner_without_rows_stands_still(name: str, reference: Any) -> None:
             assert np.any(old[0] != moved[0])
 
 
-@both
-@forms
+@pairs
 def test_masked_rows_mean_nothing(name: str, reference: Any) -> None:
     """What a masked row holds changes no bit of that learner, and all of the other one."""
     ours = learner(name, ensemble=2, reference=reference)
@@ -239,8 +246,7 @@ def value(network: Any, observation: Any, action: Any) -> Any:
     return forward(layers, np.concatenate([observation, action], axis=-1))[..., 0]
 
 
-@both
-@forms
+@pairs
 def test_target_and_deviation_by_loops(name: str, reference: Any) -> None:
     """y of each learner from its own action and critics; deviation as the form has it."""
     size, rows = 3, 7
@@ -355,8 +361,7 @@ def proposals(name: str, ours: Any, state: Any, observation: Any, rng: Any) -> l
     return found
 
 
-@both
-@forms
+@pairs
 def test_the_best_bound_by_loops(name: str, reference: Any, rng: np.random.Generator) -> None:
     """Each proposal is asked about one by one; the best is done, and it is not always one's."""
     size = 4
@@ -435,7 +440,7 @@ def test_policy_file_averages_actions(name: str, tmp_path: Path, rng: Any) -> No
 @pytest.mark.parametrize("name", ["sunrise", "multi-sunrise-td3"])
 def test_ledger_and_log_of_a_run(name: str, runs: Path) -> None:
     """Ensemble updates, passes of the bounds, stored masks and the histogram."""
-    settings = {**TINY, "steps": 300, "ensemble": 3}
+    settings = {**TINY, "hidden": (8,), "steps": 300, "ensemble": 3}
     trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
     columns, path = trainer.ensemble.columns, trainer.ensemble.replays[0].path
     last = run_to_end(trainer).rows()[-1]
@@ -455,7 +460,14 @@ def test_ledger_and_log_of_a_run(name: str, runs: Path) -> None:
 
 def test_official_updates_come_in_blocks(runs: Path) -> None:
     """Nothing is learned between two blocks, and all that is due at a block's end."""
-    settings = {**TINY, "steps": 120, "warmup": 10, "ensemble": 2, "update_every": 40}
+    settings = {
+        **TINY,
+        "hidden": (8,),
+        "steps": 120,
+        "warmup": 10,
+        "ensemble": 2,
+        "update_every": 40,
+    }
     trainer = Trainer("sunrise", "probe_envs:Scripted-v0", runs=runs, **settings)
     ensemble, seen = trainer.ensemble, []
     tick = ensemble.tick

@@ -327,6 +327,7 @@ def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     assert tomllib.loads(Path("s.best.toml").read_text())
 
 
+@pytest.mark.slow
 def test_interrupted_worker_saves(here: Path) -> None:
     words = ("--trials", "2", "--steps", "1M", "--eval-every", "1M", "--warmup", "1M")
     process = worker(*words)
