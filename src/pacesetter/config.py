@@ -202,6 +202,17 @@ class OnPolicy(Hyper):
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
+class ModelDriven(OnPolicy):
+    """Settings of every algorithm that learns from all steps so far, after each rollout."""
+
+    envs: int = Field(1, ge=1, le=1000, description="envs of a rollout, stepped in turn")
+    rollout_length: Count = Field(3000, ge=1, description="steps of each env in a rollout")
+    replay_size: Count = Field(200_000, ge=1, description="transitions kept, oldest leave first")
+    starts: int = Field(20, ge=1, description="resets an update, for imagined episodes; no steps")
+    known: bool = Field(True, description="reward and end are the walker's own, not learned")
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
 class Run:
     """What to train: the task, the budget, the members and how the best one is chosen."""
 

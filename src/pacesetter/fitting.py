@@ -55,7 +55,7 @@ def fit(
     key: Array,
     batch_size: int = 256,
     patience: int = 5,
-    epochs: int = 100,
+    epochs: int | Array = 100,
 ) -> Fit:
     """Fit all members to the first `data.valid` rows of a padded ring (S, ...), at least 250.
 

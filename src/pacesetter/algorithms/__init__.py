@@ -29,9 +29,8 @@ TABLE = {
     "steve": Entry("pacesetter.algorithms.steve", "DDPG with targets from learned models"),
     "steve-td3": Entry("pacesetter.algorithms.steve_td3", "TD3 with targets from learned models"),
     "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
-    "trpo": Entry(
-        "pacesetter.algorithms.trpo", "trust region policy optimisation, on-policy", True
-    ),
+    "trpo": Entry("pacesetter.algorithms.trpo", "trust region policy optimisation", True),
+    "me-trpo": Entry("pacesetter.algorithms.me_trpo", "TRPO in an ensemble of models", True),
 }
 
 

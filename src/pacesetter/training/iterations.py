@@ -6,15 +6,16 @@ one update from the whole rollout, then its observations join them      learn
 A checkpoint falls between iterations, so it holds no rollout: only running episodes.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from pacesetter import algorithms
+from pacesetter import algorithms, known
 from pacesetter.algorithm import Algorithm, Spec
-from pacesetter.config import Config
+from pacesetter.config import Config, ModelDriven
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
 from pacesetter.policy import Floats, Policy, clip, normalize, unstack
@@ -25,6 +26,7 @@ from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Population
 from pacesetter.training.progress import Progress
 from pacesetter.training.replay import Columns, Replay
+from pacesetter.training.sources import AllSteps, LastRollout
 
 
 class Iterations:
@@ -37,7 +39,10 @@ class Iterations:
         run, hyper, first = config.run, config.hyper, envs[0]
         self.config, self.envs = config, envs
         spec = Spec(first.observation_size, first.action_size)
-        self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
+        build = algorithms.find(run.algorithm).build
+        if isinstance(hyper, ModelDriven) and hyper.known:
+            build = partial(build, known=known.of(run.env, run.env_kwargs))
+        self.algorithm: Algorithm = build(spec, hyper)
         self.streams = [generator(run.seed, Stream.ACT, k) for k in range(len(envs))]
         self.columns = Columns(*spec)
         self.population = Population(
@@ -45,30 +50,39 @@ class Iterations:
         )
         self.states = self.population.init(1, same=False)
         self.acting = self.population.acting(self.states)
-        self.loss_names = self.population.loss_names(self.states[0])
+        source = AllSteps if isinstance(hyper, ModelDriven) else LastRollout
+        self.source: AllSteps | LastRollout = source(config, self.columns)
+        self.loss_names = self.population.loss_names(self.states[0], *self.source.shape())
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps
-        self.replays: list[Replay] = []
         self.pending: list[Pending] = []
         self.kept: list[Policy | None] = [None]  # nothing is assessed
         self.memory = [self.algorithm.begin(self.acting[0], rng) for rng in self.streams]
         self.progress = Progress.of(len(envs))
 
     def open_replays(self, folder: Path) -> None:
-        """None is needed."""
+        """Make or find the ring, if steps are kept."""
+        self.source.open(folder / "replay-0.bin", self.budget)
+
+    @property
+    def replays(self) -> list[Replay]:
+        """The ring, if there is one."""
+        return self.source.replays
 
     def tick(self) -> None:
         """One iteration; what is left of the budget at the end is too little to learn from."""
         size = self.config.hyper.rollout_length * len(self.envs)
         rows = self.collect(min(size, self.budget - self.progress.step))
+        self.source.keep(rows)
         if len(rows) == size:
-            self.learn(rows.reshape(-1, len(self.envs), self.columns.width))
+            self.learn(rows)
         self.progress.tick += 1
 
     def close(self) -> None:
-        """Let go of the envs."""
+        """Let go of envs and files."""
         for env in self.envs:
             env.close()
+        self.source.close()
 
     @property
     def statistics(self) -> Statistics:
@@ -138,10 +152,11 @@ class Iterations:
     # Learn.
 
     def learn(self, rows: Floats) -> None:
-        """One update from a rollout (T, E, width)."""
+        """One update after a rollout, whose rows (steps, width) then join the statistics."""
         progress = self.progress
+        data, extra = self.source.data(rows, progress.updates)
         result = self.population.update(
-            self.states[0], 0, progress.updates, rows, None, self.statistics
+            self.states[0], 0, progress.updates, data, None, self.statistics, extra
         )
         self.states = [result.state]
         for name, loss in zip(self.loss_names, np.asarray(result.losses), strict=True):
@@ -150,7 +165,7 @@ class Iterations:
         progress.note(np.asarray(result.losses))
         self.acting = [jax.tree.map(np.asarray, result.acting)]
         progress.updates += 1
-        progress.transitions += rows.shape[0] * rows.shape[1]
+        progress.transitions += int(extra.get("valid", len(rows)))
         if self.population.normalize:
-            for row in rows.reshape(-1, self.columns.width):
+            for row in rows:
                 self.normalizer.add(row[: self.columns.observation])

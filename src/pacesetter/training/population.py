@@ -62,19 +62,30 @@ class Population:
         rows: Floats,
         weight: Floats | None,
         statistics: Statistics,
+        extra: dict[str, Any] | None = None,
     ) -> Cycle:
         """One cycle of a member on rows (U, B, width); the given state is used up.
 
-        The call returns at once; several members' cycles follow each other without a pause.
+        `extra` are fields of the batch that are not in rows. The call returns at once; several
+        members' cycles follow each other without a pause.
         """
-        return Cycle(*self._update(state, member, tick, rows, weight, statistics, self.key))
+        inputs = (rows, weight, statistics, extra or {})
+        return Cycle(*self._update(state, member, tick, *inputs, self.key))
 
-    def loss_names(self, state: State) -> list[str]:
-        """Names of the columns of losses, in order."""
-        rows = np.zeros((self.algorithm.cycle, 1, self.columns.width), np.float32)
+    def loss_names(
+        self, state: State, rows: Floats | None = None, extra: dict[str, Any] | None = None
+    ) -> list[str]:
+        """Names of the columns of losses, in order; of rows only the shape matters."""
+        if rows is None:
+            rows = np.zeros((self.algorithm.cycle, 1, self.columns.width), np.float32)
         size = self.columns.observation
-        batch = self._batch(rows, None, (np.zeros(size), np.ones(size)))
-        return sorted(jax.eval_shape(self.algorithm.update, state, batch, self.key).losses)
+        statistics = (np.zeros(size), np.ones(size))
+
+        def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
+            batch = self._batch(rows, None, statistics)._replace(**extra)
+            return self.algorithm.update(state, batch, self.key).losses
+
+        return sorted(jax.eval_shape(losses, state, rows, extra or {}))
 
     # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
 
@@ -86,9 +97,10 @@ class Population:
         rows: Array,
         weight: Array | None,
         statistics: Any,
+        extra: dict[str, Any],
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
-        batch = self._batch(rows, weight, statistics)
+        batch = self._batch(rows, weight, statistics)._replace(**extra)
         update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, tick, member))
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.

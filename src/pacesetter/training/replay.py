@@ -128,9 +128,20 @@ class Replay:
         `earned` is what the member's episode had returned before it.
         """
         row = self.columns.pack(observation, action, reward, following, discount, last, mask)
+        self.append(row, earned, member)
+
+    def append(self, row: Floats, earned: float = 0.0, member: int = 0) -> None:
+        """Store one transition that is packed already."""
         self.rows[self.head % self.slots] = row
         self.drawing.add(self.head, member, earned)
         self.head += 1
+
+    def padded(self, size: int) -> Floats:
+        """The window as rows (size, width): row n of the run at n % size, zeros where none is."""
+        rows = np.zeros((size, self.columns.width), np.float32)
+        numbers = np.array(self.window[-size:])
+        rows[numbers % size] = self.rows[numbers % self.slots]
+        return rows
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...], done: float = 0.0) -> Sample:
         """Rows drawn from the window; `done` is the share of the horizon that has passed."""

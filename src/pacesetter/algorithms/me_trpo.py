@@ -1,0 +1,256 @@
+"""ME-TRPO (Kurutach et al. 2018), one member. Reference: thanard/me-trpo at 7dad9cd.
+
+fit K models of the task to all real steps so far
+repeat, on imagined steps from real starts, each through a model drawn at random:
+    `check_every` updates of TRPO
+    in each model alone, return of the mean action; if `share` of them say that it did not
+        fall since the policy kept last, keep this one
+until none was kept for `patience` updates; go on with the policy kept last
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as settings
+
+from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms import trpo
+from pacesetter.config import STRICT, Count, ModelDriven, Width, only
+from pacesetter.dynamics import Dynamics, Known, Models
+from pacesetter.fitting import fit
+from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
+
+
+@settings(frozen=True, kw_only=True, config=STRICT)
+class Hyper(ModelDriven, trpo.Hyper):
+    """Smaller than published, so that two cores do; the preset me-trpo-paper has those sizes."""
+
+    normalize_observation: Annotated[bool, only(False)] = Field(
+        False, description="fixed: models and rewards see the task's own numbers"
+    )
+    models: int = Field(5, ge=1, description="models of the task")
+    model_hidden: tuple[Width, ...] = Field(
+        (256, 256), min_length=1, description="widths of a model's hidden layers"
+    )
+    model_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the models")
+    model_batch_size: int = Field(1000, ge=1, description="rows in a model's minibatch")
+    model_patience: int = Field(5, ge=1, description="passes without a fall that end a fit")
+    model_rows: Count = Field(250_000, ge=1, description="rows that a fit goes through at most")
+    renew_every: int = Field(0, ge=0, description="iterations from new networks to new; 0: never")
+    imagined_steps: Count = Field(20_000, ge=1, description="imagined steps of a policy update")
+    horizon: int = Field(1000, ge=1, description="longest imagined episode")
+    bootstrap: bool = Field(True, description="the critic's value counts at the horizon")
+    policy_updates: int = Field(50, ge=1, description="policy updates of an iteration at most")
+    check_every: int = Field(5, ge=1, description="policy updates between checks in all models")
+    patience: int = Field(25, ge=1, description="policy updates without a kept policy that end it")
+    share: float = Field(0.7, ge=0, le=1, description="share of models that must not see a fall")
+    critic_epochs: int = Field(5, ge=0, description="passes of the critic over imagined steps")
+    critic_batch_size: int = Field(1000, ge=1, description="observations in its minibatches")
+
+
+class State(NamedTuple):
+    """TRPO's learner and the models."""
+
+    learner: trpo.State
+    models: Models
+    updates: Array
+
+
+class Search(NamedTuple):
+    """Where the policy's search in the models is."""
+
+    learner: trpo.State
+    kept: trpo.Gaussian
+    returns: Array  # (K,) of the policy kept last
+    stale: Array  # updates since then
+    made: Array  # updates in all
+
+
+@dataclass(frozen=True)
+class METRPO:
+    """The learner of one member."""
+
+    base: trpo.TRPO
+    dynamics: Dynamics
+    hyper: Hyper
+    cycle: int = 1
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        return NO_MASK
+
+    def init(self, key: Array) -> State:
+        learner_key, models_key = jax.random.split(key)
+        models = self.dynamics.init(models_key)
+        return State(self.base.init(learner_key), models, jnp.zeros((), jnp.int32))
+
+    def acting(self, state: State) -> trpo.Gaussian:
+        return state.learner.actor
+
+    def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
+        return ()
+
+    def act(
+        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        return self.base.act(acting, memory, observation, rng)
+
+    def update(self, state: State, batch: Batch, key: Array) -> Update:
+        """One iteration on all real steps, the first `valid` of (S, ...), and reset `starts`."""
+        fit_key, search_key = jax.random.split(key)
+        starts: Any = batch.starts
+        models, losses = self.fit_models(state, batch, fit_key)
+        search = self.search(state.learner, models, starts, search_key)
+        losses |= {"imagined_return": search.returns.mean(), "policy_updates": search.made * 1.0}
+        learner = search.learner._replace(actor=search.kept)
+        return Update(State(learner, models, state.updates + 1), losses, jnp.zeros((1, 1)))
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        return {"resets": updates * self.hyper.starts}
+
+    def policy(self, state: State) -> Actors:
+        return self.base.policy(state.learner)
+
+    # The pieces that `update` composes.
+
+    def fit_models(self, state: State, batch: Batch, key: Array) -> tuple[Models, dict[str, Array]]:
+        """The models after a fit to real steps, from where they are or, at times, from new ones."""
+        hyper, valid = self.hyper, jnp.asarray(batch.valid)
+        models = state.models
+        if hyper.renew_every:
+            due = state.updates % hyper.renew_every == 0
+            new = self.dynamics.init(jax.random.fold_in(key, 1))
+            models = jax.tree.map(lambda new, old: jnp.where(due, new, old), new, models)
+        # The env was given actions cut at +-1, so that is what changed the state.
+        data = batch._replace(action=jnp.clip(batch.action, -1, 1))
+        epochs = jnp.maximum(hyper.model_rows // valid, 1)
+        found = fit(
+            self.dynamics, models, data, key, hyper.model_batch_size, hyper.model_patience, epochs
+        )
+        return found.models, {
+            "model_loss": found.loss.mean(),
+            "model_epochs": found.epochs.astype(jnp.float32),
+        }
+
+    def search(self, learner: trpo.State, models: Models, starts: Array, key: Array) -> Search:
+        """TRPO in the models until they no longer agree that it helps."""
+        hyper = self.hyper
+        # Each search explores anew, as in the reference.
+        log_std = jnp.full_like(learner.actor.log_std, np.log(hyper.initial_std))
+        learner = learner._replace(actor=learner.actor._replace(log_std=log_std))
+
+        def update(i: Array, learner: trpo.State) -> trpo.State:
+            imagine_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+            batch = self.imagine(models, learner.actor, starts, imagine_key)
+            return self.base.update(learner, batch, update_key).state
+
+        def go_on(search: Search) -> Array:
+            return (search.stale < hyper.patience) & (search.made < hyper.policy_updates)
+
+        def improve(search: Search) -> Search:
+            made = jnp.minimum(search.made + hyper.check_every, hyper.policy_updates)
+            learner = jax.lax.fori_loop(search.made, made, update, search.learner)
+            returns = self.returns(models, learner.actor, starts)
+            keep = agree(returns, search.returns, hyper.share)
+            kept, returns = jax.tree.map(
+                lambda new, old: jnp.where(keep, new, old),
+                (learner.actor, returns),
+                (search.kept, search.returns),
+            )
+            stale = jnp.where(keep, 0, search.stale + made - search.made)
+            return Search(learner, kept, returns, stale, made)
+
+        none = jnp.zeros((), jnp.int32)
+        returns = self.returns(models, learner.actor, starts)
+        begin = Search(learner, learner.actor, returns, none, none)
+        return jax.lax.while_loop(go_on, improve, begin)
+
+    def imagine(self, models: Models, actor: trpo.Gaussian, starts: Array, key: Array) -> Batch:
+        """Imagined episodes as a rollout (horizon, E, ...), one model drawn for each step.
+
+        Where an episode ends before the horizon, another begins; it is cut with the rest.
+        """
+        hyper, dynamics = self.hyper, self.dynamics
+        envs = max(hyper.imagined_steps // hyper.horizon, 1)
+
+        def some_starts(key: Array) -> Array:
+            return starts[jax.random.randint(key, (envs,), 0, len(starts))]
+
+        def step(observation: Array, key: Array) -> tuple[Array, Batch]:
+            act_key, choice_key, model_key, start_key = jax.random.split(key, 4)
+            mean, log_std = trpo.moments(actor, observation)
+            action = mean + jnp.exp(log_std) * jax.random.normal(act_key, mean.shape)
+            one = dynamics.choose(models, jax.random.randint(choice_key, (), 0, dynamics.members))
+            parts = self.transition(one, observation[None], action[None], model_key)
+            following, reward, terminated = (part[0] for part in parts)
+            row = Batch(
+                observation=observation,
+                action=action,
+                reward=reward,
+                next_observation=following,
+                discount=hyper.gamma * (1.0 - terminated),
+                last=1.0 * terminated,
+                weight=jnp.ones(envs),
+                mask=jnp.zeros((envs, 0)),
+            )
+            return jnp.where(terminated[:, None], some_starts(start_key), following), row
+
+        start_key, steps_key = jax.random.split(key)
+        keys = jax.random.split(steps_key, hyper.horizon)
+        _, batch = jax.lax.scan(step, some_starts(start_key), keys)
+        if hyper.bootstrap:
+            return batch
+        return batch._replace(discount=batch.discount.at[-1].set(0))
+
+    def returns(self, models: Models, actor: trpo.Gaussian, starts: Array) -> Array:
+        """Mean return (K,) of the mean action in each model alone, from all starts (M, O)."""
+
+        def step(carry: tuple[Array, Array], key: Array) -> tuple[Any, Array]:
+            observation, running = carry
+            action, _ = trpo.moments(actor, observation)
+            following, reward, terminated = self.transition(models, observation, action, key)
+            return (following, running & ~terminated), running * reward
+
+        observation = jnp.stack([starts] * self.dynamics.members)
+        running = jnp.ones(observation.shape[:-1], bool)
+        # The same noise for every policy, where the models have any.
+        keys = jax.random.split(jax.random.key(0), self.hyper.horizon)
+        _, rewards = jax.lax.scan(step, (observation, running), keys)
+        return rewards.sum(axis=0).mean(axis=-1)
+
+    def transition(
+        self, models: Models, observation: Array, action: Array, key: Array
+    ) -> tuple[Array, Array, Array]:
+        """Next observation, reward and end of each member's own states (K, B, ...).
+
+        Imagined states stay within ten deviations of the real ones.
+        """
+        dynamics, scale = self.dynamics, models.scale
+        action = jnp.clip(action, -1, 1)
+        size = self.base.spec.observation_size
+        mean, reach = scale.mean[:size], OBSERVATION_LIMIT * scale.deviation[:size]
+        following = dynamics.sample(models, observation, action, key)
+        following = jnp.clip(following, mean - reach, mean + reach)
+        reward = dynamics.reward(models, observation, action, following).mean(axis=0)
+        ends = dynamics.terminated(models, observation, action, following)
+        return following, reward, ends > 0.5
+
+
+def agree(returns: Array, before: Array, share: float) -> Array:
+    """Whether at least a share of the models (K,) sees no fall."""
+    return (returns >= before).sum() >= share * len(returns) - 1e-6
+
+
+def build(spec: Spec, hyper: Hyper, known: Known | None = None) -> METRPO:
+    """The learner of one member; what is known of the task replaces learned heads."""
+    dynamics = Dynamics(
+        spec,
+        members=hyper.models,
+        hidden=hyper.model_hidden,
+        known=known,
+        learning_rate=hyper.model_learning_rate,
+    )
+    return METRPO(trpo.TRPO(spec, hyper), dynamics, hyper)

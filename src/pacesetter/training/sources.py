@@ -1,0 +1,91 @@
+"""What one update after a rollout learns from: the rollout alone, or all steps so far."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pacesetter.config import Config
+from pacesetter.envs import Environment
+from pacesetter.errors import UsageError
+from pacesetter.policy import Floats
+from pacesetter.seeding import Stream
+from pacesetter.training.replay import UNCOMMITTED, Columns, Replay
+
+Data = tuple[Floats, dict[str, Any]]  # rows and the batch's other fields
+FEWEST = 250  # rows, of which a fifth is held out by a fit
+
+
+class LastRollout:
+    """The rollout just made, in time order: (T, E, width)."""
+
+    def __init__(self, config: Config, columns: Columns) -> None:
+        self.envs, self.columns = config.hyper.envs, columns
+        self.length = config.hyper.rollout_length
+        self.replays: list[Replay] = []
+
+    def shape(self) -> Data:
+        """Data of the right shape."""
+        return np.zeros((self.length, self.envs, self.columns.width), np.float32), {}
+
+    def open(self, path: Path, budget: int) -> None:
+        """Nothing lies in a file."""
+
+    def keep(self, rows: Floats) -> None:
+        """Nothing outlives its iteration."""
+
+    def data(self, rows: Floats, update: int) -> Data:
+        """The data of an update, by its number."""
+        return rows.reshape(self.length, self.envs, self.columns.width), {}
+
+    def close(self) -> None:
+        """There is nothing to let go of."""
+
+
+class AllSteps:
+    """All steps so far, in a ring of a fixed shape (S, width), and fresh starts of episodes.
+
+    Starts are resets of an env of their own, each seeded by its number, so no state is kept.
+    """
+
+    def __init__(self, config: Config, columns: Columns) -> None:
+        run, hyper = config.run, config.hyper
+        self.columns, self.starts = columns, hyper.starts
+        self.capacity = min(hyper.replay_size, run.steps)
+        rollout = hyper.envs * hyper.rollout_length
+        if not FEWEST <= rollout <= min(UNCOMMITTED, hyper.replay_size):
+            raise UsageError(
+                f"rollout_length: a rollout of all envs must have {FEWEST} to "
+                f"{min(UNCOMMITTED, hyper.replay_size)} steps, it has {rollout}"
+            )
+        self.size = hyper.replay_size
+        self.env = Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, hyper.envs)
+        self.replays: list[Replay] = []
+
+    def shape(self) -> Data:
+        """Data of the right shape."""
+        rows = np.zeros((self.capacity, self.columns.width), np.float32)
+        starts = np.zeros((self.starts, self.columns.observation), np.float32)
+        return rows, {"starts": starts, "valid": 0}
+
+    def open(self, path: Path, budget: int) -> None:
+        """Make or find the ring."""
+        self.replays.append(Replay(path, self.columns, self.size, budget))
+
+    def keep(self, rows: Floats) -> None:
+        """Put a rollout into the ring."""
+        for row in rows:
+            self.replays[0].append(row)
+
+    def data(self, rows: Floats, update: int) -> Data:
+        """The data of an update, by its number."""
+        ring, first = self.replays[0], update * self.starts
+        starts = [self.env.reset(episode) for episode in range(first, first + self.starts)]
+        valid = min(len(ring), self.capacity)
+        return ring.padded(self.capacity), {"starts": np.stack(starts), "valid": valid}
+
+    def close(self) -> None:
+        """Let go of env and file."""
+        self.env.close()
+        for replay in self.replays:
+            replay.close()
