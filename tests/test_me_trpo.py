@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
+import test_kill
 from conftest import assert_same, log, run_to_end
+from pacesetter import config
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import me_trpo, trpo
+from pacesetter.cli import main
 from pacesetter.config import settle
 from pacesetter.dynamics import Known, Models
 from pacesetter.errors import UsageError
@@ -299,6 +302,19 @@ def test_stopped_run_equals_uninterrupted(known: bool, runs: Path) -> None:
 
 
 @pytest.mark.slow
+def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["train", "me-trpo", "Hopper-v5", "--steps", "8000", "--eval-episodes", "1", "-q"]
+    words += ["--checkpoint-every", "0.1s", "--hidden", "8", "--model-hidden", "16"]
+    for name in ("models", "rollout_length", "imagined_steps", "horizon", "policy_updates"):
+        words += [f"--{name.replace('_', '-')}", str(SMALL[name])]
+    words += ["--model-rows", "3000", "--model-batch-size", "64", "--replay-size", "3000"]
+    monkeypatch.setitem(test_kill.KILLED, "Hopper-v5", words)
+    killed = test_kill.kill_and_resume("Hopper-v5", tmp_path, kills=2, seed=1)
+    assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
+    assert_same(test_kill.only_run(tmp_path / "whole"), killed)
+
+
+@pytest.mark.slow
 def test_probe_is_learned_in_learned_models(runs: Path) -> None:
     """Reward -4 (a - .5)^2 of a task of one step, whose reward and end must be learned too."""
     settings = {
@@ -352,9 +368,21 @@ def test_unknown_reward_is_refused_unless_it_is_learned(runs: Path) -> None:
     assert not runs.exists()
 
 
+def test_preset_builds_with_the_values_of_its_file() -> None:
+    table = config.presets()["me-trpo-paper"]
+    run, hyper = settle("me-trpo-paper", "HalfCheetah-v5")
+    for key in table.keys() - {"algorithm", "help", "source", "env"}:
+        value = table[key]
+        assert getattr(hyper, key) == (tuple(value) if isinstance(value, list) else value), key
+    learner = me_trpo.build(Spec(17, 6), hyper)
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    assert state.learner.actor.network[0]["kernel"].shape == (17, 32)
+    assert state.models.networks.change[0]["kernel"].shape == (5, 23, 1024)
+    assert (run.members, table["help"] != "", table["source"] != "") == (1, True, True)
+
+
 def test_published_sizes() -> None:
-    config = settle("me-trpo-paper", "Humanoid-v5")
-    hyper = config.hyper
+    hyper = settle("me-trpo-paper", "Humanoid-v5").hyper
     assert hyper.model_hidden == (1024, 1024)
     assert (hyper.models, hyper.imagined_steps, hyper.policy_updates) == (5, 50_000, 400)
     assert (hyper.rollout_length, hyper.horizon, hyper.bootstrap) == (6_000, 100, False)
