@@ -309,6 +309,9 @@ def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.Monke
         words += [f"--{name.replace('_', '-')}", str(SMALL[name])]
     words += ["--model-rows", "3000", "--model-batch-size", "64", "--replay-size", "3000"]
     monkeypatch.setitem(test_kill.KILLED, "Hopper-v5", words)
+    # A ring of the usual size: a whole rollout lies between two checkpoints.
+    plain = "import sys; from pacesetter.cli import main; sys.exit(main())"
+    monkeypatch.setattr(test_kill, "COMMAND", plain)
     killed = test_kill.kill_and_resume("Hopper-v5", tmp_path, kills=2, seed=1)
     assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
     assert_same(test_kill.only_run(tmp_path / "whole"), killed)
