@@ -318,9 +318,10 @@ def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, 
     seen: list[tuple[Any, ...]] = []
     update = iterations.population.update
 
-    def spy(state: Any, member: int, tick: int, rows: Any, weight: Any, statistics: Any) -> Any:
+    def spy(state: Any, member: int, tick: int, rows: Any, weight: Any, *rest: Any) -> Any:
+        statistics, *_ = rest
         seen.append((iterations.acting[0], rows.copy(), statistics))
-        return update(state, member, tick, rows, weight, statistics)
+        return update(state, member, tick, rows, weight, *rest)
 
     monkeypatch.setattr(iterations.population, "update", spy)
     return seen
