@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +50,14 @@ class Ray:
 
     def __init__(self, slots: int | None, address: str | None) -> None:
         try:
-            import ray
+            ray: Any = import_module(
+                "ray"
+            )  # an extra that may be absent, also where types are checked
         except ImportError:
             raise UsageError(
                 "executor: ray is not installed; pip install 'pacesetter[scale]'"
             ) from None
-        self._ray: Any = ray
+        self._ray = ray
         try:
             ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         except (ConnectionError, ValueError, RuntimeError) as error:
