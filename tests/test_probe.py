@@ -39,6 +39,7 @@ CROSSQ = NO_ENTROPY | {
 }
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
+MODELS = {"model_hidden": (32,), "head_hidden": (16,), "critic_members": 2}
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": ("td3", {}),
     "ddpg": ("ddpg", {}),
@@ -51,6 +52,8 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "ddpg-parameter": ("ddpg", NOISY),
     "sunrise": ("sunrise", NO_ENTROPY | FEW),
     "sunrise-td3": ("sunrise-td3", FEW),
+    "steve": ("steve", MODELS | {"exploration_noise": 2.0}),
+    "steve-td3": ("steve-td3", MODELS),
 }
 
 
