@@ -513,3 +513,11 @@ def test_an_ensemble_uses_no_key_twice(name: str) -> None:
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(ours.init), KEY)
         jax.eval_shape(jax.jit(ours.update), state, batch, KEY)
+
+
+@both
+def test_settings_of_the_base_keep_their_defaults(name: str) -> None:
+    """Such as SAC's warm-up of 10k; only the exploration of TD3's proposals is fixed."""
+    ours, base = (settle(each, "HalfCheetah-v5").hyper for each in (name, BASES[name]))
+    for setting in vars(base):
+        assert getattr(ours, setting) == getattr(base, setting), setting

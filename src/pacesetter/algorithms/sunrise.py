@@ -24,15 +24,18 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter.algorithm import Array, Batch, Spec, State, Update
 from pacesetter.algorithms import sac
 from pacesetter.algorithms.td3 import UNROLLED
-from pacesetter.config import STRICT, Count, OffPolicy, only
+from pacesetter.config import STRICT, Count, only
 from pacesetter.policy import Actors, Floats, clip, forward
 
 BINS = 5  # of the backups' weights, which lie in [.5, 1]
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Ensemble(OffPolicy):
-    """Defaults are the reference's, with `ucb` from the range that the paper searched."""
+class Ensemble:
+    """What the ensemble adds; without a base class, whose defaults would hide the learner's own.
+
+    Defaults are the reference's, with `ucb` from the range that the paper searched.
+    """
 
     ensemble: int = Field(5, ge=1, le=100, description="learners in one state (N)")
     mask_probability: float = Field(
