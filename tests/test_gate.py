@@ -32,7 +32,7 @@ def costs(name: str) -> dict[str, float]:
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
     rows = jax.ShapeDtypeStruct((algorithm.cycle, 256, columns.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
-    lowered = population._update.lower(state, 0, 0, rows, None, still, population.key)
+    lowered = population._update.lower(state, 0, 0, rows, None, still, {}, population.key)
     found: Any = lowered.compile().cost_analysis()
     return {key: found[key] / algorithm.cycle for key in ("flops", "bytes accessed")}
 
