@@ -18,7 +18,7 @@ from pacesetter.config import Config
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts
-from pacesetter.policy import Floats, Policy, clip, normalize, unstack
+from pacesetter.policy import Floats, Policy, clip, normalize
 from pacesetter.rules import Parents
 from pacesetter.seeding import Stream, generator
 from pacesetter.training import priorities
@@ -126,10 +126,7 @@ class Ensemble:
 
     def current(self, member: int) -> Policy:
         """A member's policy as it is now."""
-        actors, env = self.algorithm.policy(self.states[member]), self.envs[0]
-        statistics = self.statistics if self.population.normalize else None
-        layers = unstack(actors)
-        return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
+        return self.population.policy(self.states[member], self.envs[0], self.statistics)
 
     def replay(self, k: int) -> Replay:
         """The replay of a member: the shared one, or its own."""

@@ -18,7 +18,7 @@ from pacesetter.algorithm import Algorithm, Spec
 from pacesetter.config import Config, ModelDriven
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
-from pacesetter.policy import Floats, Policy, clip, normalize, unstack
+from pacesetter.policy import Floats, Policy, clip, normalize
 from pacesetter.seeding import Stream, generator
 from pacesetter.training.ensemble import blame
 from pacesetter.training.n_step import Pending
@@ -98,10 +98,7 @@ class Iterations:
 
     def policy(self, member: int) -> Policy:
         """The policy as it is now."""
-        actors, env = self.algorithm.policy(self.states[member]), self.envs[0]
-        statistics = self.statistics if self.population.normalize else None
-        layers = unstack(actors)
-        return Policy(layers, actors.activation, actors.output, env.low, env.high, statistics)
+        return self.population.policy(self.states[member], self.envs[0], self.statistics)
 
     current = policy
 

@@ -1,6 +1,7 @@
 """One learner compiled once and called for each of K members, whose states are a plain list.
 
-On a CPU one call a member is as fast as one call for all: the cores share each matrix product.
+The cores share each matrix product, so members need no common call: for one member that is quicker
+than `vmap`, and for any number it is one program.
 Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
 so a waiting member shifts nobody's stream and no state ever holds a key.
 """
@@ -14,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter.algorithm import Algorithm, Array, State
-from pacesetter.policy import OBSERVATION_LIMIT, Floats
+from pacesetter.envs import Environment
+from pacesetter.policy import OBSERVATION_LIMIT, Floats, Policy, unstack
 from pacesetter.rules import Parents
 from pacesetter.training.normalizer import Statistics
 from pacesetter.training.replay import Columns
@@ -86,6 +88,13 @@ class Population:
             return self.algorithm.update(state, batch, self.key).losses
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))
+
+    def policy(self, state: State, env: Environment, statistics: Statistics) -> Policy:
+        """What acts without noise in an env like this one, in NumPy alone."""
+        actors = self.algorithm.policy(state)
+        scale = statistics if self.normalize else None
+        layers = unstack(actors)
+        return Policy(layers, actors.activation, actors.output, env.low, env.high, scale)
 
     # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
 
