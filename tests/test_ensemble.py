@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -399,6 +400,19 @@ def test_clones_do_not_stay_clones(runs: Path) -> None:
     states = jax.device_get(trainer.ensemble.states)
     for part in NETWORKS:
         assert all_differ(*(getattr(state, part) for state in states))
+
+
+def test_members_at_the_same_time_learn_as_one_after_the_other(runs: Path) -> None:
+    """Threads change nothing: the states equal those of a run whose members take turns."""
+    states: list[Any] = []
+    for name in ("together", "in-turn"):
+        trainer = start(runs, name=name, members=3, rule="none", steps=90, replay="prioritized")
+        ensemble = trainer.ensemble
+        if name == "in-turn":
+            ensemble.workers = SimpleNamespace(map=map, shutdown=lambda: None)
+        run_to_end(trainer)
+        states.append(jax.device_get(ensemble.states))
+    assert same(*states)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])

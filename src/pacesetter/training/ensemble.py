@@ -5,6 +5,7 @@ members that owe enough updates make them on their own batches  learn
 when the round is over, all start again from the rule's choice  turn
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,7 @@ class Ensemble:
         self.budget = run.steps * config.unit
         self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
+        self.workers = ThreadPoolExecutor(run.members)  # a thread starts when first needed
         self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
         self.kept: list[Policy | None] = [None] * run.members  # the best assessed policies
         self.warmup_streams = [generator(run.seed, Stream.WARMUP, k) for k in range(run.members)]
@@ -101,7 +103,8 @@ class Ensemble:
         return trial.returns
 
     def close(self) -> None:
-        """Let go of envs and files."""
+        """Let go of envs, files and threads."""
+        self.workers.shutdown()
         for env in (*self.envs, self.trial_env):
             if env is not None:
                 env.close()
@@ -243,30 +246,36 @@ class Ensemble:
         return not hyper.assess or member.assessment.over
 
     def _update(self, members: list[int]) -> None:
-        """All members' cycles are sent off before the first result is waited for."""
-        cycles = [self._cycle(k) for k in members]
-        for k, (sample, cycle) in zip(members, cycles, strict=True):
-            losses = np.asarray(cycle.losses)
-            self._check(k, losses)
-            self.progress.note(losses)
+        """A cycle of every member, at the same time."""
+        samples = [self._draw(k) for k in members]
+        run = map if len(members) == 1 else self.workers.map
+        cycles = list(run(self._cycle, members, samples))
+        for k, sample, cycle in zip(members, samples, cycles, strict=True):
+            self.states[k] = cycle.state
+            self._check(k, cycle.losses)
+            self.progress.note(cycle.losses)
             self.replay(k).feedback(sample.numbers, np.asarray(cycle.error))
             self.acting[k] = jax.tree.map(np.asarray, cycle.acting)
+            self.progress.members[k].cycles += 1
 
-    def _cycle(self, k: int) -> tuple[Sample, Cycle]:
+    def _draw(self, k: int) -> Sample:
         progress, cycle = self.progress, self.algorithm.cycle
-        member, shape = progress.members[k], (cycle, self.config.hyper.batch_size)
-        sample = self.replay(k).sample(
-            self.sample_streams[k], shape, self._done() if self.horizon else 1.0
-        )
-        result = self.population.update(
-            self.states[k], k, member.cycles, sample.rows, sample.weight, self.statistics
-        )
-        self.states[k] = result.state
-        member.owed -= cycle
-        member.cycles += 1
+        shape = (cycle, self.config.hyper.batch_size)
+        progress.members[k].owed -= cycle
         progress.updates += cycle
         progress.transitions += shape[0] * shape[1]
-        return sample, result
+        done = self._done() if self.horizon else 1.0
+        return self.replay(k).sample(self.sample_streams[k], shape, done)
+
+    def _cycle(self, k: int, sample: Sample) -> Cycle:
+        return self.population.update(
+            self.states[k],
+            k,
+            self.progress.members[k].cycles,
+            sample.rows,
+            sample.weight,
+            self.statistics,
+        )
 
     def _done(self) -> float:
         """Share of the horizon that has passed, over which importance weights become whole."""

@@ -1,7 +1,7 @@
 """One learner compiled once and called for each of K members, whose states are a plain list.
 
-The cores share each matrix product, so members need no common call: for one member that is quicker
-than `vmap`, and for any number it is one program.
+Members share a program, not a call: alone, one is quicker so than under `vmap`, and several that
+are called from threads of their own keep more of the cores busy than one product split over them.
 Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
 so a waiting member shifts nobody's stream and no state ever holds a key.
 """
@@ -30,10 +30,10 @@ class Draw(IntEnum):
 
 
 class Cycle(NamedTuple):
-    """What a cycle of one member gave; arrays may still be under way until NumPy reads them."""
+    """What a cycle of one member gave."""
 
     state: State
-    losses: Array  # (losses,)
+    losses: Floats  # (losses,)
     error: Array  # (U, B)
     acting: Any  # what it acts with now
 
@@ -68,11 +68,11 @@ class Population:
     ) -> Cycle:
         """One cycle of a member on rows (U, B, width); the given state is used up.
 
-        `extra` are fields of the batch that are not in rows. The call returns at once; several
-        members' cycles follow each other without a pause.
+        `extra` are fields of the batch that are not in rows. Members may be called from threads.
         """
         inputs = (rows, weight, statistics, extra or {})
-        return Cycle(*self._update(state, member, tick, *inputs, self.key))
+        state, losses, error, acting = self._update(state, member, tick, *inputs, self.key)
+        return Cycle(state, np.asarray(losses), error, acting)  # NumPy waits for the result
 
     def loss_names(
         self, state: State, rows: Floats | None = None, extra: dict[str, Any] | None = None
