@@ -2,7 +2,7 @@
 
 python benchmarks/jobs.py
 
-A measurement is a process of its own; both ways take turns, on an otherwise idle machine. `bench`
+A measurement is a process of its own; all ways take turns, on an otherwise idle machine. `bench`
 pins its runs to a core each because that was faster.
 """
 
@@ -10,6 +10,7 @@ import argparse
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from itertools import pairwise
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -51,7 +52,7 @@ def together(env: str, steps: int, jobs: list[set[int]]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--steps", type=int, default=20_000, help="measured steps of each run")
+    parser.add_argument("--steps", type=int, default=5_000, help="measured steps of each run")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--measure", type=int, help=argparse.SUPPRESS)
     found = parser.parse_args()
@@ -61,7 +62,12 @@ def main() -> None:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         sys.exit("needs two cores")
-    ways = {"two runs, a core each": [{cores[0]}, {cores[1]}], "one run on both": [{*cores[:2]}]}
+    first, second = cores[:2]
+    ways = {
+        "two runs, a core each": [{first}, {second}],
+        "one run on both": [{first, second}],
+        "one run on one": [{first}],
+    }
     rates: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(found.rounds):
         for name, jobs in ways.items():
@@ -71,9 +77,11 @@ def main() -> None:
         for name, values in rates.items()
     ]
     print(tabulate(rows, (f"td3 on {found.env}", "steps/s, median", "each round"), "github"))
-    pinned, both = (median(values) for values in rates.values())
+    pinned, both, lone = (median(values) for values in rates.values())
     word = "faster" if pinned > both else "slower"
     print(f"two pinned runs are {word}: {pinned / both:.2f} times the steps/s of one on both cores")
+    print(f"two pinned runs / twice one pinned alone = {pinned / (2 * lone):.2f} (target 0.88)")
+    print(f"{len(cores)} cores, jax {version('jax')}, medians of {found.rounds} rounds")
 
 
 if __name__ == "__main__":

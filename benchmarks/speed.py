@@ -17,6 +17,7 @@ import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
@@ -39,11 +40,12 @@ class Algorithm(NamedTuple):
     peer: str | None
     theirs: Settings
     noise: float | None = None
+    envs: tuple[str, ...] = ("HalfCheetah-v5",)
 
     @property
     def libraries(self) -> tuple[str, ...]:
         """Who has it."""
-        return ("pacesetter", *PEERS) if self.peer else ("pacesetter",)
+        return ("pacesetter", *PEERS, ALONE) if self.peer else ("pacesetter",)
 
 
 RATE = 3e-4
@@ -61,16 +63,24 @@ THEIRS: Settings = {
 }
 ALGORITHMS = {
     "td3": Algorithm(
-        OUR_RATES | {"policy_delay": 2, "exploration_noise": 0.1}, "TD3", {"policy_delay": 2}, 0.1
+        OUR_RATES | {"policy_delay": 2, "exploration_noise": 0.1},
+        "TD3",
+        {"policy_delay": 2},
+        0.1,
+        ("HalfCheetah-v5", "Ant-v5", "Humanoid-v5"),
     ),
     "sac": Algorithm(OUR_RATES | {"alpha_learning_rate": RATE}, "SAC", {"ent_coef": "auto"}),
     "sunrise": Algorithm(OUR_RATES | {"alpha_learning_rate": RATE, "ensemble": 5}, None, {}),
 }
 PEERS = {"SB3": "stable_baselines3", "SBX": "sbx"}
-TARGETS = {
-    ("td3", "HalfCheetah-v5", "SB3"): 3.5,
-    ("td3", "HalfCheetah-v5", "SBX"): 1.8,
+ALONE = "env alone"
+TARGETS = {  # and stretch targets
+    ("td3", "HalfCheetah-v5", "SB3"): (4.0, 4.5),
+    ("td3", "HalfCheetah-v5", "SBX"): (2.1, 2.4),
+    ("sac", "HalfCheetah-v5", "SB3"): (4.0, 4.5),
+    ("sac", "HalfCheetah-v5", "SBX"): (1.7, 1.9),
 }
+SCALED = 0.9  # target, of the speed that operations foretell from HalfCheetah's
 PACKAGES = ("pacesetter", "jax", "torch", "stable-baselines3", "sbx-rl", "gymnasium", "mujoco")
 START = 2_000  # 1000 steps of warm-up, then 1000 that compile and settle
 REPORTED = 1_000  # pacesetter reports its training so often
@@ -129,10 +139,28 @@ def rate(marks: list[Mark]) -> float:
     return (last - first) / (ended - began)
 
 
+def time_env(env: str, steps: int, seed: int) -> float:
+    """Steps/s of the env with actions of no learner, as training steps it."""
+    import numpy as np
+
+    from pacesetter.envs import Environment
+    from pacesetter.seeding import Stream
+
+    task, rng = Environment(env, {}, seed, Stream.TRAIN), np.random.default_rng(seed)
+    task.reset()
+    began = perf_counter()
+    for _ in range(steps):
+        if task.step(rng.uniform(-1, 1, task.action_size)).ended:
+            task.reset()
+    return steps / (perf_counter() - began)
+
+
 def measure(library: str, name: str, env: str, steps: int, seed: int) -> float:
     """One measurement in this process, in its working directory."""
     if library in PEERS:
         return time_peer(library, name, env, steps, seed)
+    if library == ALONE:
+        return time_env(env, steps, seed)
     return time_ours(name, env, steps, seed)
 
 
@@ -185,7 +213,7 @@ def ratio_line(name: str, env: str, peer: str, rates: Rates) -> str:
     """How many times faster than a peer: the median over rounds, which share the weather."""
     ratios = [ours / theirs for ours, theirs in zip(rates["pacesetter"], rates[peer], strict=True)]
     target = TARGETS.get((name, env, peer))
-    aim = "" if target is None else f"; target {target}"
+    aim = "" if target is None else "; target {}, stretch {}".format(*target)
     label = f"{name} {env}: pacesetter / {peer} {ALGORITHMS[name].peer}"
     return f"{label} = {median(ratios):.2f} (median of {len(ratios)} pairwise ratios{aim})"
 
@@ -199,6 +227,25 @@ def cost_line(name: str, env: str, base: str, rate: float, base_rate: float) -> 
     return (
         f"{name} {env}: a step takes {base_rate / rate:.1f} times that of {base} "
         f"(ratio of medians; learning takes {ours / theirs:.1f} times the operations)"
+    )
+
+
+def scaled_line(name: str, env: str, rates: Rates, base: str, base_rates: Rates) -> str:
+    """Our speed over what HalfCheetah's foretells: its time outside the env grows as the FLOPs."""
+    import flops
+
+    mine, theirs = (
+        flops.megaflops(name, flops.spec_of(x), **ALGORITHMS[name].ours) for x in (env, base)
+    )
+    ratios = []
+    for ours, alone, base_ours, base_alone in zip(
+        rates["pacesetter"], rates[ALONE], base_rates["pacesetter"], base_rates[ALONE], strict=True
+    ):
+        foretold = (1 / base_ours - 1 / base_alone) * mine / theirs + 1 / alone
+        ratios.append(ours * foretold)
+    return (
+        f"{name} {env}: pacesetter / what {base} foretells = {median(ratios):.2f} "
+        f"({mine / theirs:.2f} times the operations; target {SCALED})"
     )
 
 
@@ -234,7 +281,7 @@ def options() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description="Compare training speed with SB3 and SBX.")
     parser.add_argument("--algorithm", nargs="+", choices=ALGORITHMS, default=[*ALGORITHMS])
-    parser.add_argument("--env", nargs="+", default=["HalfCheetah-v5"])
+    parser.add_argument("--env", nargs="+", help="default: an algorithm's own")
     parser.add_argument("--steps", type=timed_steps, default=3_000, help="timed steps")
     parser.add_argument("--repeats", type=int, default=3, help="rounds over all libraries")
     parser.add_argument("--measure", nargs=5, help=argparse.SUPPRESS)
@@ -249,15 +296,25 @@ def main() -> None:
         print(measure(library, name, env, int(steps), int(seed)))
         return
     print(f"{machine()}; {chosen.steps} timed steps, {chosen.repeats} rounds", flush=True)
-    for env in chosen.env:
-        medians: dict[str, float] = {}
-        for name in chosen.algorithm:
+    found: dict[tuple[str, str], Rates] = {}
+    for name in chosen.algorithm:
+        for env in chosen.env or ALGORITHMS[name].envs:
             rates, taken = measure_all(name, env, chosen.steps, chosen.repeats)
             report(name, env, rates, taken)
-            medians[name] = median(rates["pacesetter"])
-            if ALGORITHMS[name].peer is None:
-                for base in (x for x in medians if ALGORITHMS[x].peer):
-                    print(cost_line(name, env, base, medians[name], medians[base]), flush=True)
+            found[name, env] = rates
+            for line in beside(name, env, found):
+                print(line, flush=True)
+
+
+def beside(name: str, env: str, found: dict[tuple[str, str], Rates]) -> Iterator[str]:
+    """What was measured set beside other learners, for an ensemble, or other tasks."""
+    rates = found[name, env]
+    for (base, task), others in found.items():
+        if task == env and ALGORITHMS[name].peer is None and ALGORITHMS[base].peer:
+            ours, theirs = (median(x["pacesetter"]) for x in (rates, others))
+            yield cost_line(name, env, base, ours, theirs)
+        if base == name and task != env and task == "HalfCheetah-v5" and ALONE in rates:
+            yield scaled_line(name, env, rates, task, others)
 
 
 if __name__ == "__main__":

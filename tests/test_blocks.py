@@ -11,7 +11,7 @@ from numeric import KEY, member, mlp, quantile_loss, random_batch, random_state
 from pacesetter import heads
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import sac, td3
-from pacesetter.config import STRICT
+from pacesetter.settings import STRICT
 
 SPEC = Spec(observation_size=3, action_size=2)
 DISTRIBUTION = np.arange(1.0, 6.0)

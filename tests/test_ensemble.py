@@ -248,6 +248,32 @@ def test_selection_episodes_are_counted(steps: int, trials: int, runs: Path) -> 
     assert last["episodes"] == sum(last["member_steps"]) // 20 * 2  # trials train nobody
 
 
+def test_selection_episodes_may_go_uncounted(runs: Path) -> None:
+    """The members make the whole budget themselves; the ledger names the trials all the same."""
+    eager: dict[str, Any] = {"select_on": "eval", "select_every": 50, "select_window": 2}
+    trainer = start(runs, steps=140, count_selection_steps=False, **eager, **IDLE)
+    last = log(run_to_end(trainer))[-1]
+    assert last["step"] == sum(last["member_steps"]) == 140
+    assert last["selection_steps"] == 80
+
+
+@pytest.mark.parametrize(
+    ("warmup", "after", "first"), [(0, None, 20), (0, 45, 80), (45, None, 80), (45, 0, 20)]
+)
+def test_selection_begins_with_a_round_after_its_own_time(
+    warmup: int, after: int | None, first: int, runs: Path
+) -> None:
+    """Rounds of 20 steps count if they began at `select_after` or later, by default the warm-up."""
+    trainer = start(runs, lengths=(10, 10), warmup=warmup, select_after=after)
+    assert select_rows(trainer)[0]["step"] == first
+
+
+def test_trials_begin_after_their_own_time(runs: Path) -> None:
+    """With `select_after` 60 and one each 50 steps, the first is at 100."""
+    trainer = start(runs, select_on="eval", select_every=50, select_after=60, steps=200, **IDLE)
+    assert select_rows(trainer)[0]["step"] == 120  # and its two episodes
+
+
 def test_selection_on_trials_chooses_by_their_mean(runs: Path) -> None:
     """By the trials' returns, not by training's; a selection cut short decides nothing."""
     trainer = start(

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from conftest import TINY, content, run_to_end
-from pacesetter.config import OffPolicy
+from pacesetter.settings import OffPolicy
 from pacesetter.training import priorities
 from pacesetter.training.priorities import ByError, ByReturn, Sums, Uniform, choose
 from pacesetter.training.replay import Columns, Replay

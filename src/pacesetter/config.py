@@ -1,4 +1,4 @@
-"""What to train and how: typed settings, merged from many places, checked once."""
+"""What to train and how: settings merged from many places and checked once."""
 
 import re
 import tomllib
@@ -8,208 +8,19 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    ValidationInfo,
-)
+from pydantic import AfterValidator, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
 from pacesetter.errors import UsageError, unknown
 from pacesetter.rules import RULES
-
-Settings = dict[str, Any]
-STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-_MULTIPLES = {"": 1, "k": 1_000, "m": 1_000_000}
-_SECONDS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
-
-
-def _count(value: object) -> object:
-    found = re.fullmatch(r"(\d+(?:\.\d+)?(?:e\d+)?)([km]?)", str(value).strip().lower())
-    if found is None:
-        raise ValueError("is not a count; write 5000, 300k, 1M or 1e6")
-    number = float(found[1]) * _MULTIPLES[found[2]]
-    if number > 1e15:
-        raise ValueError("is too large")
-    if number != int(number):
-        raise ValueError("is not a whole number")
-    return int(number)
-
-
-def _duration(value: object) -> object:
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", str(value).strip().lower())
-    if value is not None and found is None:
-        raise ValueError("is not a length of time; write 90s, 5m or 2h")
-    return value if found is None else float(found[1]) * _SECONDS[found[2]]
+from pacesetter.settings import ROWS_A_TICK, STRICT, Count, Duration, OffPolicy, OnPolicy, Settings
 
 
 def _rule(value: str) -> str:
     if value not in RULES:
         raise unknown("rule", value, RULES)
     return value
-
-
-def only(value: float) -> AfterValidator:
-    """A setting that this algorithm fixes."""
-
-    def check(given: float) -> float:
-        if given != value:
-            raise ValueError(f"is fixed for this algorithm; allowed: {value}")
-        return given
-
-    return AfterValidator(check)
-
-
-def _only_with(*kinds: str) -> AfterValidator:
-    """A setting that only some kinds of replay use."""
-
-    def check(value: object, info: ValidationInfo) -> object:
-        kind = info.data.get("replay", kinds[0])
-        if value not in (None, False) and kind not in kinds:
-            raise ValueError(f"is a setting of --replay {' and '.join(kinds)}, not of {kind}")
-        return value
-
-    return AfterValidator(check)
-
-
-def _has_weights(value: object, info: ValidationInfo) -> object:
-    kind, given = info.data.get("replay"), info.data.get("replay_importance")
-    if value is not None and not (given or (given is None and REPLAYS.get(kind or "", (0, 1))[1])):
-        raise ValueError("is of importance weights, of which there are none; --replay-importance")
-    return value
-
-
-def _assessed(value: int | None, info: ValidationInfo) -> int | None:
-    if value is not None and not info.data.get("assess"):
-        raise ValueError("is a setting of --assess, which is off")
-    return value
-
-
-ROWS_A_TICK = 1_000  # that a replay takes, of all members together
-# The exponents of priorities and of importance weights that each kind of replay has by itself.
-REPLAYS = {
-    "uniform": (0.0, 0.0),
-    "prioritized": (0.6, 0.4),
-    "lap": (0.4, 0.0),
-    "return": (0.6, 0.0),
-}
-
-
-class Tune(NamedTuple):
-    """Range in which `tune` searches the setting that is annotated with it; or False and True."""
-
-    low: float
-    high: float
-    log: bool = False
-
-    def has(self, value: Any) -> bool:
-        """Whether a value lies in it."""
-        return self.low <= value <= self.high
-
-
-Width = Annotated[int, Field(ge=1, le=16_384)]
-Count = Annotated[int, BeforeValidator(_count)]
-Duration = Annotated[float, BeforeValidator(_duration)]
-LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
-Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]
-Warmup = Annotated[Count, Tune(1_000, 25_000, log=True)]
-Switch = Annotated[bool, Tune(False, True)]
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Hyper:
-    """Settings that every algorithm has; each algorithm's own `Hyper` adds to them."""
-
-    gamma: Annotated[float, Tune(0.97, 0.999)] = Field(
-        0.99, ge=0, le=1, description="discount a step"
-    )
-    normalize_observation: Switch = Field(
-        False, description="running mean and deviation, cut at 10"
-    )
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class OffPolicy(Hyper):
-    """Settings of every algorithm that learns from a replay."""
-
-    batch_size: Annotated[int, Tune(64, 512, log=True)] = Field(
-        256, ge=1, description="transitions in a minibatch"
-    )
-    replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
-    replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
-        "uniform", description="rows are drawn alike, by TD error (PER; LAP) or by episode return"
-    )
-    replay_exponent: Annotated[float | None, _only_with("prioritized", "lap", "return")] = Field(
-        None, ge=0, le=2, description="power of priorities, 0 is uniform; none is 0.6, for lap 0.4"
-    )
-    replay_importance: Annotated[float | None, _only_with("prioritized", "return")] = Field(
-        None,
-        ge=0,
-        le=1,
-        description="power of importance weights at first, later 1; 0 is no weights; "
-        "none is 0.4, for return 0",
-    )
-    replay_horizon: Annotated[
-        Count | None, _only_with("prioritized", "return"), AfterValidator(_has_weights)
-    ] = Field(None, ge=1, description="steps until that power is 1; none is --steps at the start")
-    replay_to_go: Annotated[bool, _only_with("return")] = Field(
-        False, description="rank rows by what the episode still paid, not by all of it"
-    )
-    n_step: int = Field(1, ge=1, le=100, description="rewards summed before the target's value")
-    assess: int = Field(
-        0, ge=0, description="episodes that assess a policy before it learns on (TD7: 20); 0 is off"
-    )
-    assess_after: Annotated[Count | None, AfterValidator(_assessed)] = Field(
-        None, ge=0, description="a member's updates before which one assesses; none is 750000"
-    )
-    warmup: Warmup = Field(25_000, ge=0, description="first steps of all members, uniform actions")
-    warmup_updates: bool = Field(False, description="update during the warm-up too")
-    updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
-    update_at: Literal["step", "episode"] = Field(
-        "step", description="as they fall due, or all at the episode's end"
-    )
-    update_every: Count | None = Field(
-        None, ge=1, description="own steps between blocks of updates; none is 1"
-    )
-
-    @property
-    def block(self) -> int:
-        """Own env steps after which the updates that have fallen due are made."""
-        return self.update_every or 1
-
-    @property
-    def exponents(self) -> tuple[float, float]:
-        """Of priorities and of importance weights, given or the replay's own."""
-        exponent, importance = REPLAYS[self.replay]
-        if self.replay_exponent is not None:
-            exponent = self.replay_exponent
-        if self.replay_importance is not None:
-            importance = self.replay_importance
-        return exponent, importance
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class OnPolicy(Hyper):
-    """Settings of every algorithm that learns from the rollout just made, and then drops it."""
-
-    envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
-    rollout_length: Count = Field(64, ge=1, description="steps of each env in a rollout")
-    normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class ModelDriven(OnPolicy):
-    """Settings of every algorithm that learns from all steps so far, after each rollout."""
-
-    envs: int = Field(1, ge=1, le=1000, description="envs of a rollout, stepped in turn")
-    rollout_length: Count = Field(3000, ge=1, description="steps of each env in a rollout")
-    replay_size: Count = Field(200_000, ge=1, description="transitions kept, oldest leave first")
-    starts: int = Field(20, ge=1, description="resets an update, for imagined episodes; no steps")
-    known: bool = Field(True, description="reward and end are the walker's own, not learned")
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -232,6 +43,10 @@ class Run:
     )
     select_every: Count = Field(5_000, ge=1, description="steps between selections on eval")
     select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
+    select_after: Count | None = Field(
+        None, ge=0, description="steps before which nothing is selected; none is the warm-up"
+    )
+    count_selection_steps: bool = Field(True, description="extra episodes are part of --steps")
     copy: Literal["full", "weights", "actor"] = Field(
         "full", description="networks and optimiser, networks alone, or the actor alone"
     )
@@ -250,7 +65,8 @@ class Run:
 
 
 # What only members that share a replay need.
-OF_MEMBERS = ("members", "rule", "select_on", "select_every", "select_window", "copy", "same_init")
+SELECTION = ("select_on", "select_every", "select_window", "select_after", "count_selection_steps")
+OF_MEMBERS = ("members", "rule", *SELECTION, "copy", "same_init")
 OF_ENSEMBLES = (*OF_MEMBERS, "count", "wait", "replay_scope")
 
 
@@ -264,6 +80,12 @@ class Config(NamedTuple):
     def unit(self) -> int:
         """Steps of all members that budget and clocks count as one."""
         return self.run.members if self.run.count == "member" else 1
+
+    @property
+    def select_after(self) -> int:
+        """Steps of all members before which nothing is selected."""
+        after = self.run.select_after
+        return self.hyper.warmup if after is None else after
 
     def settings(self) -> Settings:
         """All settings as one flat table, which `settle` takes back."""

@@ -5,8 +5,8 @@ import tomllib
 from dataclasses import fields
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
-from pacesetter.config import Settings
 from pacesetter.errors import UsageError, unknown
+from pacesetter.settings import Settings
 
 _POSITIONAL = {"algorithm", "env", "env_kwargs"}
 _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below", "min_length": "length"}

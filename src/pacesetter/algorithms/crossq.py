@@ -28,8 +28,8 @@ from pacesetter import heads, nets, renorm
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import sac
 from pacesetter.algorithms.td3 import UNROLLED
-from pacesetter.config import STRICT, Count, OffPolicy, Width
 from pacesetter.policy import Actors, Floats, Layers
+from pacesetter.settings import STRICT, Count, OffPolicy, Width
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -19,10 +19,10 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import trpo
-from pacesetter.config import STRICT, Count, ModelDriven, Width, only
 from pacesetter.dynamics import Dynamics, Known, Models
 from pacesetter.fitting import fit
 from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
+from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -22,8 +22,8 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.config import STRICT, LearningRate, OffPolicy, Switch, Tau, Warmup, Width
 from pacesetter.policy import Actors, Floats, Layers, clip, forward
+from pacesetter.settings import STRICT, LearningRate, OffPolicy, Switch, Tau, Warmup, Width
 
 LOG_STD_RANGE = (-20.0, 2.0)
 

@@ -21,10 +21,10 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter import nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import ddpg, td3
-from pacesetter.config import STRICT, Width
 from pacesetter.dynamics import Dynamics, Models
 from pacesetter.exploration import Kind
 from pacesetter.policy import Actors, Floats
+from pacesetter.settings import STRICT, Width
 
 SMALLEST_VARIANCE = 1e-8  # as in the reference
 

@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import steve, td3
-from pacesetter.config import STRICT
+from pacesetter.settings import STRICT
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -24,8 +24,8 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter.algorithm import Array, Batch, Spec, State, Update
 from pacesetter.algorithms import sac
 from pacesetter.algorithms.td3 import UNROLLED
-from pacesetter.config import STRICT, Count, only
 from pacesetter.policy import Actors, Floats, clip, forward
+from pacesetter.settings import STRICT, Count, only
 
 BINS = 5  # of the backups' weights, which lie in [.5, 1]
 

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import Array, Batch, Spec
 from pacesetter.algorithms import sunrise, td3
-from pacesetter.config import STRICT
+from pacesetter.settings import STRICT
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -21,9 +21,9 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import heads, nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.config import STRICT, LearningRate, OffPolicy, Switch, Tau, Tune, Width
 from pacesetter.exploration import ADAPT_EVERY, KINDS, Kind, adapt_sigma, first_sigma
 from pacesetter.policy import Actors, Floats
+from pacesetter.settings import STRICT, LearningRate, OffPolicy, Switch, Tau, Tune, Width
 
 UNROLLED = 4  # critic steps a loop; without one, XLA need not copy states between iterations
 

@@ -22,8 +22,8 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter import nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.config import STRICT, OnPolicy, Width
 from pacesetter.policy import Actors, Floats, forward
+from pacesetter.settings import STRICT, OnPolicy, Width
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -12,8 +12,9 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked
 
-from pacesetter.config import STRICT, Count, build
+from pacesetter.config import build
 from pacesetter.errors import UsageError, unknown
+from pacesetter.settings import STRICT, Count
 from pacesetter.study import stats
 from pacesetter.study.results import Run, gather
 from pacesetter.study.stats import Array

@@ -8,8 +8,8 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from pacesetter.config import Settings, Tune
 from pacesetter.errors import UsageError
+from pacesetter.settings import Settings, Tune
 
 try:
     import optuna

@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, Settings, read_file, settle
+from pacesetter.config import Config, read_file, settle
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
+from pacesetter.settings import Settings
 
 FOLDER = Path(__file__).with_name("suites")
 MOST_SEEDS = 10_000

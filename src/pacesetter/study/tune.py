@@ -15,10 +15,11 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.config import Settings, settle
+from pacesetter.config import settle
 from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
+from pacesetter.settings import Settings
 from pacesetter.sinks import Sink, console
 from pacesetter.storage import write_atomically
 from pacesetter.study.journal import (

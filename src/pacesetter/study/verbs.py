@@ -5,10 +5,11 @@ import shlex
 import sys
 from typing import Any
 
-from pacesetter.config import Run, Settings, preset_layers, settle
+from pacesetter.config import Run, preset_layers, settle
 from pacesetter.errors import UsageError
 from pacesetter.flags import Parser, add_settings, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
+from pacesetter.settings import Settings
 from pacesetter.study import suite as suites
 from pacesetter.study.suite import Suite
 

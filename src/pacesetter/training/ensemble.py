@@ -7,6 +7,7 @@ when the round is over, all start again from the rule's choice  turn
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ class Ensemble:
         self.memory = [self.algorithm.begin(acting, spare) for acting in self.acting]
         self.progress = Progress.of(run.members)
         every = run.select_every * config.unit
-        self.progress.next_selection = (hyper.warmup // every + 1) * every
+        self.progress.next_selection = (config.select_after // every + 1) * every
         self.trial_env: Environment | None = None
 
     def open_replays(self, folder: Path) -> None:
@@ -96,10 +97,14 @@ class Ensemble:
         if self.trial_env is None:
             self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
         first, left = progress.selections * run.select_window, self.budget - progress.step
+        counted = run.count_selection_steps
         with blame(k, progress.step):
             act = self.current(k).act
-            trial = rollouts(act, self.trial_env, run.select_window, first, limit=left)
+            trial = rollouts(
+                act, self.trial_env, run.select_window, first, limit=left if counted else inf
+            )
         progress.selection_steps += sum(trial.lengths)
+        progress.free_steps += 0 if counted else sum(trial.lengths)
         return trial.returns
 
     def close(self) -> None:
@@ -204,7 +209,8 @@ class Ensemble:
         progress.ended.append([k, member.episode_return, member.episode_length])
         self.replay(k).drawing.end(k, member.episode_return)
         learned = member.started >= self.config.hyper.warmup
-        member.end(counts=learned and run.members > 1 and run.select_on == "train")
+        selects = run.members > 1 and run.select_on == "train"
+        member.end(counts=selects and member.started >= self.config.select_after)
         if self.config.hyper.assess and learned:
             self._assess(k, member)
 

@@ -61,6 +61,7 @@ class Progress:
     members: list[Member]
     tick: int = 0
     selection_steps: int = 0
+    free_steps: int = 0  # of selection, those that the budget does not count
     updates: int = 0
     transitions: int = 0
     episodes: int = 0
@@ -91,8 +92,9 @@ class Progress:
 
     @property
     def step(self) -> int:
-        """Env steps so far, of all members and of selection."""
-        return sum(member.steps for member in self.members) + self.selection_steps
+        """Env steps so far, of all members and, where it is counted, of selection."""
+        members = sum(member.steps for member in self.members)
+        return members + self.selection_steps - self.free_steps
 
     def each(self) -> Iterator[tuple[int, Member]]:
         return enumerate(self.members)

@@ -57,7 +57,7 @@ def on_training(ensemble: Ensemble) -> Selection | None:
 def on_trials(ensemble: Ensemble) -> Selection | None:
     """Select on extra noise-free episodes with the same starts for each; their steps count."""
     config, progress = ensemble.config, ensemble.progress
-    if progress.step <= config.hyper.warmup or progress.step < progress.next_selection:
+    if progress.step <= config.select_after or progress.step < progress.next_selection:
         return None
     every = config.run.select_every * config.unit
     returns = [ensemble.trial(k) for k in range(config.run.members)]

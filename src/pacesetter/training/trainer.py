@@ -8,13 +8,14 @@ from typing import Any, Self
 
 import jax
 
-from pacesetter.config import OnPolicy, read_file, settle
+from pacesetter.config import read_file, settle
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
+from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
 from pacesetter.training.ensemble import Ensemble, blame
 from pacesetter.training.iterations import Iterations
@@ -113,7 +114,7 @@ class Trainer:
         self.ensemble = (Iterations if on_policy else Ensemble)(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []
-        self._stopping = self._closed = False
+        self.stopping = self._closed = False
         self._clock = Clock()
 
     def __iter__(self) -> Iterator[Report]:
@@ -128,7 +129,7 @@ class Trainer:
                 self._report_what_is_due(ending)
                 reports, self._reports = self._reports, []
                 yield from reports
-                if ending or self._stopping:
+                if ending or self.stopping:
                     break
                 if self._save_is_due():
                     self.save()
@@ -166,7 +167,7 @@ class Trainer:
 
     def stop(self) -> None:
         """Ask for the end after the running tick; may be called from a signal handler."""
-        self._stopping = True
+        self.stopping = True
 
     def save(self) -> None:
         """Write a checkpoint now."""
