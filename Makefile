@@ -24,6 +24,7 @@ test: .venv/tested
 	$(BIN)/pytest -m 'not slow' -n 2
 
 test-slow: .venv/tested
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[scale]'
 	$(BIN)/pytest -m slow
 
 check: .venv/tested
@@ -33,6 +34,12 @@ check: .venv/tested
 
 bench-speed: .venv/peers
 	$(BIN)/python benchmarks/speed.py
+	NPROC=1 taskset -c 0 $(BIN)/python benchmarks/ceiling.py
+	$(BIN)/python benchmarks/ceiling.py
+	$(BIN)/python benchmarks/ceiling.py --members 2
+	$(BIN)/python benchmarks/costs.py outside members checkpoint startup memory
+	$(BIN)/python benchmarks/jobs.py
+	$(BIN)/python benchmarks/models.py
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache

@@ -28,6 +28,7 @@ from pacesetter.training.population import Population
 from pacesetter.training.replay import Columns
 
 SPECS = {"HalfCheetah-v5": Spec(17, 6), "Ant-v5": Spec(105, 8), "Humanoid-v5": Spec(348, 17)}
+TARGETS = {("td3", 1, 1): 0.82, ("td3", 2, 1): 0.7, ("td3", 2, 2): 0.75}  # cores, members
 TOGETHER = 4  # independent products a timed call, few enough to stay in the cache
 Product = tuple[tuple[int, ...], tuple[int, ...], Any]  # both shapes, dimension numbers
 
@@ -123,11 +124,13 @@ def main() -> None:
     took, floor = (median(column) for column in zip(*found, strict=True))
     work = sum(flops(p) * n for p, n in counts.items()) / updates
     cores = len(os.sched_getaffinity(0))
+    target = TARGETS.get((chosen.algorithm, cores, chosen.members))
+    aim = "" if target is None else f" (target {target})"
     print(
         f"{chosen.algorithm} {chosen.env}, {chosen.members} members, {cores} cores, "
         f"jax {jax.__version__}: {work / 1e6:.0f} MFLOP an update; {1 / took:.0f} updates/s; "
         f"its products alone {1 / floor:.0f}/s ({work / floor / 1e9:.0f} GFLOP/s); "
-        f"share of the ceiling = {median(f / t for t, f in found):.3f}"
+        f"share of the ceiling = {median(f / t for t, f in found):.3f}{aim}"
     )
 
 

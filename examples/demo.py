@@ -3,11 +3,8 @@
 All is written below the working directory: runs/, demo.png and demo.mp4.
 """
 
-import os
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
 
 from tabulate import tabulate
 
@@ -17,6 +14,7 @@ from pacesetter.evaluation import evaluate
 from pacesetter.media.curve import curve
 from pacesetter.media.record import record
 from pacesetter.policy import Policy
+from pacesetter.process import stopping
 from pacesetter.runs import RunDirectory
 from pacesetter.sinks import console
 
@@ -62,22 +60,12 @@ def open_run() -> Trainer:
 
 def train(trainer: Trainer) -> bool:
     """Spend what is left of the budget; False if Ctrl-C ended it early, with all saved."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        if trainer.stopping:
-            os._exit(128 + number)
-        trainer.stop()
-
     if trainer.finished:
         trainer.close()
         return True
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        with console(trainer) as show:
-            for report in trainer:
-                show(report)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with stopping(trainer.stop), console(trainer) as show:
+        for report in trainer:
+            show(report)
     return trainer.finished
 
 

@@ -1,49 +1,89 @@
-"""Rebuild every table and figure that the documents quote, from results/evaluations.jsonl.
+"""Rebuild every table and figure that the documents quote, from the .jsonl files beside it.
 
-python results/summary.py                       prints the tables
-python results/summary.py --figures DIR         draws the curves into DIR/curves.pdf as well
-python results/summary.py --collect RUNS...     first writes results/evaluations.jsonl from folders
+python results/summary.py                           prints the tables of all studies
+python results/summary.py --study pilot             of one
+python results/summary.py --figures DIR             also draws the curves into DIR/STUDY.pdf
+python results/summary.py --collect pilot RUNS...   first takes finished runs into pilot.jsonl
 
-`pacesetter compare results/evaluations.jsonl --mixed` makes other tables of the same file.
+`pacesetter compare results/pilot.jsonl --mixed` makes other tables of the same runs.
 """
 
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 from pacesetter.runs import find_all
-from pacesetter.study import contents, contrasts, tables
-from pacesetter.study.comparison import compare
+from pacesetter.study import contents, contrasts, paper, tables
+from pacesetter.study.comparison import Comparison, compare
 from pacesetter.study.figures import pdf
 from pacesetter.study.results import compact
 
-FILE = Path(__file__).with_name("evaluations.jsonl")
-POINTS = (30_000, 100_000, 200_000)
+HERE = Path(__file__).parent
+# What each study is compared at: env steps, or CPU time.
+STUDIES: dict[str, list[dict[str, str]]] = {
+    "pilot": [{"budget": "30k"}, {"budget": "100k"}, {"budget": "200k"}],
+    "family": [{"budget": "30k"}, {"budget": "100k"}],
+    "choices": [{"budget": "30k"}],
+    "trust-region": [{"budget": "1M"}],
+    "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "5m"}],
+    "imagined": [{"budget": "45k"}],
+    "walkers": [{"budget": "30k"}],
+}
 
 
-def collect(folders: list[str]) -> None:
-    """One line a run: settings, versions, commit, evaluations with their ledger, selections."""
-    runs = [run for folder in folders for run in find_all(folder)]
-    lines = [json.dumps(compact(run), separators=(",", ":")) for run in runs]
-    FILE.write_text("".join(line + "\n" for line in lines))
+def collect(study: str, folders: list[str]) -> None:
+    """Take runs in, one line each; a line of the same task, name and seed gives way."""
+    file = HERE / f"{study}.jsonl"
+    old = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    new = [compact(run) for folder in folders for run in find_all(folder)]
+    table = {_key(line): line for line in (*old, *new)}
+    lines = [json.dumps(table[key], separators=(",", ":")) for key in sorted(table)]
+    file.write_text("".join(line + "\n" for line in lines))
+
+
+def _key(line: dict[str, Any]) -> tuple[str, ...]:
+    return tuple(json.dumps(line["settings"][key]) for key in ("env", "env_kwargs", "name", "seed"))
+
+
+def shown(study: str, limit: dict[str, str]) -> str:
+    """The tables of a study at one place."""
+    there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
+    found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
+    found += contrasts.best_of_two(there)
+    if (beside := paper.published(there)) is not None:
+        found.append(beside)
+    name, value = next(iter(limit.items()))
+    return tables.markdown(f"{study}: {name} {value}", there.notes, found)
+
+
+def selections(there: Comparison) -> str:
+    """What each choice of a parent rested on."""
+    return tables.markdown("Selections", there.notes, contrasts.selections(there))
 
 
 def main() -> None:
-    """Print the tables at each point that runs reached, and draw the figures if asked to."""
+    """Print the tables of the studies, and draw the figures if asked to."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--collect", metavar="RUNS", nargs="+", help="folders of finished runs")
-    parser.add_argument("--figures", metavar="DIR", help="where to draw curves")
+    parser.add_argument("--study", choices=STUDIES, help="this one only")
+    parser.add_argument("--collect", metavar=("STUDY", "RUNS"), nargs="+", help="take runs in")
+    parser.add_argument("--figures", metavar="DIR", type=Path, help="where to draw curves")
     found = parser.parse_args()
     if found.collect:
-        collect(found.collect)
-    for budget in POINTS:
-        there = compare([FILE], budget=budget)
-        shown = [contents.details(there), contents.speed(there), *contrasts.against(there)]
-        print(tables.markdown(f"{budget:,} env steps", there.notes, shown))
-    everything = compare([FILE], mixed=True)
-    print(tables.markdown("Selections", everything.notes, contrasts.selections(everything)))
-    if found.figures:
-        pdf(everything, Path(found.figures) / "curves.pdf")
+        study, *folders = found.collect
+        if study not in STUDIES or not folders:
+            parser.error(f"--collect: a study ({', '.join(STUDIES)}), then folders of runs")
+        collect(study, folders)
+    for study in [found.study] if found.study else STUDIES:
+        if not (HERE / f"{study}.jsonl").exists():
+            continue
+        for limit in STUDIES[study]:
+            print(shown(study, limit))
+        everything = compare([HERE / f"{study}.jsonl"], mixed=True)
+        if any(contrasts.selections(everything)):
+            print(selections(everything))
+        if found.figures:
+            pdf(everything, found.figures / f"{study}.pdf")
 
 
 if __name__ == "__main__":

@@ -518,6 +518,28 @@ def test_foreign_log(run: RunDirectory, refused: Refused) -> None:
     says(refused("show", run.path), ["metrics.jsonl", "damaged"])
 
 
+def test_log_whose_lines_are_no_rows(run: RunDirectory, refused: Refused) -> None:
+    run.metrics_file.write_text("3\n")
+    says(refused("show", run.path), ["metrics.jsonl", "damaged"])
+    run.metrics_file.write_text('{"kind": "eval"}\n')
+    says(refused("show", run.path), [str(run.path), "damaged"])
+
+
+def test_list_goes_on_after_a_damaged_run(
+    run: RunDirectory, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A config without steps spoils its own line only."""
+    shutil.copytree(run.path, copy := run.path.with_name("7"))
+    table = json.loads(run.config_file.read_text())
+    del table["settings"]["steps"]
+    run.config_file.write_text(json.dumps(table))
+    capsys.readouterr()
+    assert main(["list", "runs", "--runs", str(run.path.parents[2])]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(str(run.path) in line and "damaged or foreign: 'steps'" in line for line in lines)
+    assert any(str(copy) in line and "of 700" in line for line in lines)
+
+
 def change(**settings: Any) -> Callable[[dict[str, Any]], object]:
     """Settings of config.json to these."""
     return lambda table: table["settings"].update(settings)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import demo
 import jax
 import pytest
 
@@ -18,6 +20,7 @@ from pacesetter.algorithm import Spec
 from pacesetter.algorithms import ddpg
 from pacesetter.cli import VERBS, main
 from pacesetter.config import Run, settle
+from pacesetter.evaluation import evaluate
 from pacesetter.flags import split_env_kwargs
 from pacesetter.policy import load
 from pacesetter.runs import RunDirectory, find
@@ -441,6 +444,35 @@ def test_eval_of_a_run(command: Command) -> None:
         rf"{PROBE}: return -?[\d.]+ \+- [\d.]+ over 2 episodes of 100 steps; policy of step 1\n",
         text,
     )
+
+
+def test_eval_of_uniform_actions_and_longer_episodes(command: Command) -> None:
+    """The same task without the policy, and with another keyword of its constructor."""
+    directory = trained(command, "td3", "--steps", 1)
+    words = ("eval", directory.path, "--episodes", 2, "--json")
+    short = json.loads(command(*words, "--env.max_episode_steps", 7))
+    assert short["lengths"] == [7, 7]
+    assert short["env_kwargs"] == {"max_episode_steps": 7}
+    text = command("eval", directory.path, "--episodes", 2, "--random")
+    assert text.endswith("over 2 episodes of 100 steps; uniform actions\n")
+    drawn = json.loads(command(*words, "--random"))
+    assert drawn["policy"] is None
+    assert drawn["returns"] == evaluate(None, PROBE, 2).returns
+
+
+def test_the_demo_saves_on_ctrl_c(runs: Path) -> None:
+    """The first signal ends it after the running tick, with all saved."""
+    trainer = Trainer("td3", PROBE, runs=runs, **{**TINY, "steps": 100_000})
+    tick = trainer.ensemble.tick
+
+    def interrupted() -> Any:
+        if trainer.progress.step == 50:
+            signal.raise_signal(signal.SIGINT)
+        return tick()
+
+    trainer.ensemble.tick = interrupted
+    assert not demo.train(trainer)
+    assert Trainer.resume(trainer.directory.path).progress.step == 51
 
 
 def test_iterator_breaks_and_goes_on(runs: Path) -> None:

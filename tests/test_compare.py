@@ -126,6 +126,39 @@ def test_several_budgets_are_refused_unless_cut_or_mixed(tmp_path: Path) -> None
     assert [run.updates[-1] for run in cut.runs] == [0, 0]  # a cut run's ledger is cut too
 
 
+def test_equal_cpu_time_cuts_each_run_where_it_stood(tmp_path: Path) -> None:
+    """Runs of other lengths need no --mixed then; one that never spent so much is left out."""
+    small(tmp_path, seed=0)
+    make_run(tmp_path, "Ant-v5", "td3", 1, budget=40_000, evaluations=20)
+    spent = sorted(run.cpu[-1] for run in compare([tmp_path], mixed=True).runs)
+    cut = compare([tmp_path], cpu=spent[0])
+    assert len(cut.runs) == 2
+    assert all(run.cpu[-1] <= spent[0] for run in cut.runs)
+    assert f"Every run counts up to {spent[0]:,.0f} CPU seconds." in cut.notes
+    alone = compare([tmp_path], cpu=spent[1])
+    assert [run.seed for run in alone.runs] == [1]
+    assert "CPU seconds)" in alone.notes[0]
+    with pytest.raises(UsageError, match="cpu: cuts runs at another place than --budget"):
+        compare([tmp_path], cpu="1m", budget="10k")
+
+
+def test_a_setting_that_only_newer_runs_have_is_no_difference(tmp_path: Path) -> None:
+    small(tmp_path, seed=0)
+    small(tmp_path, seed=1, count_selection_steps=True)
+    assert len(compare([tmp_path]).runs) == 2
+
+
+def test_uncounted_selection_steps_are_told(tmp_path: Path) -> None:
+    small(tmp_path, name="multi-td3", count_selection_steps=False)
+    assert any("Steps of selection come on top" in note for note in compare([tmp_path]).notes)
+
+
+def test_the_paper_suites_ant_stands_in_the_papers_tables(tmp_path: Path) -> None:
+    make_run(tmp_path, "pacesetter/Ant111-v4", "multi-td3", budget=20_000, evaluations=10)
+    text = tables.plain(paper.tables(compare([tmp_path])))
+    assert "(v4, 111, n=1, 20k" in text
+
+
 def test_other_settings_under_one_name_are_refused(tmp_path: Path) -> None:
     small(tmp_path, seed=0)
     small(tmp_path, seed=1, batch_size=100)
@@ -340,7 +373,7 @@ def test_published_numbers_are_whole() -> None:
         assert ("budget" in source) + ("budgets" in source) + ("said" in source) == 1
         for values in source["returns"].values():
             assert len(values) == len(source["budgets"]) if "budgets" in source else values
-    assert split("pacesetter/Ant111-v4") == ("pacesetter/Ant111", "v4")
+    assert split("pacesetter/Ant111-v4") == ("Ant", "v4, 111")
 
 
 # The command.
@@ -432,5 +465,5 @@ def test_comparing_imports_no_jax(runs: Path) -> None:
 def test_the_reported_tables_come_from_the_repository(tmp_path: Path) -> None:
     script = [sys.executable, ROOT / "results" / "summary.py", "--figures", tmp_path]
     done = subprocess.run(script, capture_output=True, text=True, check=True)
-    assert "# 100,000 env steps" in done.stdout
-    assert (tmp_path / "curves.pdf").read_bytes().startswith(b"%PDF")
+    assert "# pilot: budget 100k" in done.stdout
+    assert (tmp_path / "pilot.pdf").read_bytes().startswith(b"%PDF")

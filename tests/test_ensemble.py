@@ -329,6 +329,15 @@ def test_without_waiting_the_quick_member_goes_on(runs: Path) -> None:
     assert rows[-1]["member_steps"] == [60, 60]
 
 
+def test_an_episode_counts_for_the_weights_that_played_it(runs: Path) -> None:
+    """Member 0 loses at step 24, within its second episode, which then decides nothing: at 48, when
+    member 1 ends again, the third one is awaited.
+    """
+    trainer = start(runs, returns=([5], [9]), lengths=(10, 12), wait=False, **IDLE)
+    rows = select_rows(trainer)
+    assert [row["step"] for row in rows][:2] == [24, 60]
+
+
 def test_window_takes_the_mean_of_its_episodes(runs: Path) -> None:
     """A selection every second round, on those two rounds; gap and error by hand."""
     trainer = start(runs, returns=([1, 3], [9, 5]), select_window=2, **IDLE)
@@ -346,24 +355,32 @@ def test_window_takes_the_mean_of_its_episodes(runs: Path) -> None:
 def test_error_of_single_episodes_pools_the_last_selections() -> None:
     """Returns (3, 5) have variance 2, (4, 4) have 0: errors sqrt(2 * 2), then sqrt(2 * 1)."""
     variances: list[float] = []
-    first = measure(np.array([[3.0], [5.0]]), variances)
+    first = measure(np.array([[3.0], [5.0]]), variances, False)
     assert first == (2, 2)
-    gap, error = measure(np.array([[4.0], [4.0]]), variances)
+    gap, error = measure(np.array([[4.0], [4.0]]), variances, False)
     assert gap == 0
     np.testing.assert_allclose(error, 2**0.5)
 
 
 def test_error_forgets_after_twenty_selections() -> None:
     variances: list[float] = []
-    measure(np.array([[0.0], [1000.0]]), variances)
+    measure(np.array([[0.0], [1000.0]]), variances, False)
     for _ in range(REMEMBERED):
-        last = measure(np.array([[3.0], [5.0]]), variances)
+        last = measure(np.array([[3.0], [5.0]]), variances, False)
     assert REMEMBERED == len(variances) == 20
     assert last == (2, 2)
 
 
+def test_error_of_paired_episodes_leaves_out_their_starts() -> None:
+    """Differences 4 and 6: variance 2, so an error of 1; what a start gives to all is no noise."""
+    returns = np.array([[1.0, 3.0], [5.0, 9.0]])
+    assert measure(returns, [], True) == (5, 1)
+    assert measure(returns + np.array([0.0, 100.0]), [], True) == (5, 1)
+    assert measure(returns, [], False) == (5, 5**0.5)  # variances 2 and 8, n = 2
+
+
 def test_gap_is_to_the_second_best() -> None:
-    assert measure(np.array([[1.0, 3.0], [9.0, 5.0], [6.0, 6.0]]), [])[0] == 1
+    assert measure(np.array([[1.0, 3.0], [9.0, 5.0], [6.0, 6.0]]), [], False)[0] == 1
 
 
 # Rules that are controls.

@@ -389,3 +389,16 @@ def test_published_sizes() -> None:
     assert hyper.model_hidden == (1024, 1024)
     assert (hyper.models, hyper.imagined_steps, hyper.policy_updates) == (5, 50_000, 400)
     assert (hyper.rollout_length, hyper.horizon, hyper.bootstrap) == (6_000, 100, False)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_imagined_steps_are_drawn_where_models_learn_noise(noise: bool) -> None:
+    """Two keys, one state and action: the same next state without noise, another with it."""
+    algorithm = learner(model_noise=noise)
+    models = algorithm.dynamics.init(jax.random.key(0))
+    states, actions = jnp.zeros((2, 3, 1)), jnp.zeros((2, 3, 1))
+    one, other = (
+        np.asarray(algorithm.transition(models, states, actions, jax.random.key(number))[0])
+        for number in (1, 2)
+    )
+    assert np.array_equal(one, other) != noise

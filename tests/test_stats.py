@@ -72,7 +72,7 @@ def test_iqm_is_the_mean_of_the_middle_half() -> None:
 
 def test_iqm_of_several_tasks_is_resampled_within_each() -> None:
     """Two tasks whose runs are all alike have no spread, however far apart the tasks are."""
-    flat, far = np.zeros(5), np.full(5, 100.0)
+    flat, far = np.zeros(10), np.full(10, 100.0)
     assert stats.iqm([flat, far]) == (50, 50, 50)
     noisy = np.random.default_rng(1).normal(size=(3, 10))
     found = stats.iqm(list(noisy))
@@ -87,14 +87,19 @@ def test_few_seeds_get_no_bootstrap_interval() -> None:
     assert math.isnan(stats.iqm([few]).low)
     assert math.isnan(stats.improvement([(few, ONE)]).low)
     assert np.isnan(stats.profile([few], few)[1]).all()
+    nine = np.arange(9.0)  # enough for BCa, not for percentiles
+    assert math.isnan(stats.iqm([nine, nine]).low)
+    assert not math.isnan(stats.iqm([nine]).low)
+    assert math.isnan(stats.improvement([(nine, nine)]).low)
+    assert np.isnan(stats.profile([nine], nine)[1]).all()
     found = stats.iqm([ONE])
     assert found.low < found.value < found.high
 
 
 def test_improvement_is_mann_whitneys_u() -> None:
     rng = np.random.default_rng(2)
-    x, y = rng.integers(0, 6, 9).astype(float), rng.integers(0, 6, 7).astype(float)
-    u = scipy.mannwhitneyu(x, y).statistic / (9 * 7)
+    x, y = rng.integers(0, 6, 12).astype(float), rng.integers(0, 6, 10).astype(float)
+    u = scipy.mannwhitneyu(x, y).statistic / (12 * 10)
     found = stats.improvement([(x, y)])
     assert found.value == pytest.approx(u)
     assert stats.improvement([(y, x)]).value == pytest.approx(1 - u)
@@ -102,18 +107,26 @@ def test_improvement_is_mann_whitneys_u() -> None:
     assert 0 <= found.low < found.value < found.high <= 1
 
 
+def test_improvement_without_a_lost_pair_gets_no_interval() -> None:
+    """Resampling would give 1 each time, which is no certainty."""
+    found = stats.improvement([(np.arange(10.0) + 100, np.arange(10.0))])
+    assert found.value == 1
+    assert math.isnan(found.low)
+
+
 def test_improvement_interval_equals_one_drawn_run_by_run() -> None:
     rng = np.random.default_rng(3)
-    x, y = rng.normal(0.5, 1, 8), rng.normal(0, 1, 6)
-    a = x[rng.integers(8, size=(20_000, 8))]
-    b = y[rng.integers(6, size=(20_000, 6))]
+    x, y = rng.normal(0.5, 1, 12), rng.normal(0, 1, 10)
+    a = x[rng.integers(12, size=(20_000, 12))]
+    b = y[rng.integers(10, size=(20_000, 10))]
     expected = np.quantile((a[:, :, None] > b[:, None]).mean(axis=(1, 2)), [0.025, 0.975])
     found = stats.improvement([(x, y)])
     assert [found.low, found.high] == pytest.approx(expected, abs=0.025)
 
 
 def test_profile_is_the_share_of_runs_above() -> None:
-    value, low, high = stats.profile([ONE, ONE + 1], numbers(0, 16, 64.5, 99))
+    twice = np.repeat(ONE, 2)
+    value, low, high = stats.profile([twice, twice + 1], numbers(0, 16, 64.5, 99))
     np.testing.assert_allclose(value, [1, (4 / 8 + 5 / 8) / 2, 1 / 16, 0])
     assert low[0] == high[0] == 1
     assert low[1] < value[1] < high[1]

@@ -16,6 +16,7 @@ from pacesetter.algorithms import sunrise
 from pacesetter.config import settle
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy, forward, load, unstack
+from pacesetter.training import ensemble
 from pacesetter.training.trainer import Trainer, _prepare_jax
 
 SPEC = Spec(observation_size=3, action_size=2)
@@ -469,17 +470,41 @@ def test_official_updates_come_in_blocks(runs: Path) -> None:
         "update_every": 40,
     }
     trainer = Trainer("sunrise", "probe_envs:Scripted-v0", runs=runs, **settings)
-    ensemble, seen = trainer.ensemble, []
-    tick = ensemble.tick
+    seen: list[int] = []
+    tick = trainer.ensemble.tick
 
     def watched() -> Any:
         found = tick()
-        seen.append(ensemble.progress.updates)
+        seen.append(trainer.progress.updates)
         return found
 
-    ensemble.tick = watched
+    trainer.ensemble.tick = watched
     run_to_end(trainer)
     assert seen == [0] * 39 + [30] * 40 + [70] * 40 + [110]
+
+
+def test_blocks_longer_than_a_tick_are_made_whole(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The env waits until all due updates are made; where the ticks end changes nothing."""
+    small = {"hidden": (8,), "steps": 120, "warmup": 10, "ensemble": 2, "update_every": 40}
+    states: list[Any] = []
+    for name, longest in (("whole", 500), ("parts", 7)):
+        monkeypatch.setattr(ensemble, "LONGEST", longest)
+        trainer = Trainer(
+            "sunrise", "probe_envs:Scripted-v0", runs=runs, name=name, **{**TINY, **small}
+        )
+        run_to_end(trainer)
+        assert trainer.progress.updates == 110
+        states.append(jax.device_get(trainer.ensemble.states))
+    pairs = zip(*map(jax.tree.leaves, states), strict=True)
+    assert all(np.array_equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize("other", [{"update_at": "episode"}, {"assess": 2}])
+def test_blocks_and_episode_ends_are_refused_together(other: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match="update_every: blocks of 50 steps"):
+        settle("td3", "HalfCheetah-v5", {"update_every": 50, **other})
 
 
 def test_forms_have_their_blocks() -> None:

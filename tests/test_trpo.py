@@ -22,7 +22,12 @@ from pacesetter.errors import TrainingError, UsageError
 from pacesetter.training.trainer import Trainer
 from test_resume import stop_at
 
-SMALL: dict[str, Any] = {"hidden": (8, 8), "envs": 3, "rollout_length": 20, "critic_batch_size": 16}
+SMALL: dict[str, Any] = {
+    "hidden": (8, 8),
+    "parallel_envs": 3,
+    "rollout_length": 20,
+    "critic_batch_size": 16,
+}
 RUN: dict[str, Any] = {**SMALL, "eval_episodes": 1, "eval_every": 1_000, "checkpoint_every": 3600}
 
 
@@ -248,7 +253,7 @@ def test_critic_learns_in_units_of_reward() -> None:
 LEARNS: dict[str, Any] = {
     **RUN,
     "hidden": (32, 32),
-    "envs": 8,
+    "parallel_envs": 8,
     "rollout_length": 32,
     "steps": 256 * 20,
     "eval_every": 100_000,
@@ -327,7 +332,7 @@ def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, 
     return seen
 
 
-@pytest.mark.parametrize("steps", [60 * 3, 60 * 4 - 1, 59])
+@pytest.mark.parametrize("steps", [60 * 3, 60 * 4 - 1])
 def test_budget_is_made_exactly(steps: int, runs: Path) -> None:
     """Whole rollouts are learned from; what is left is stepped, but too little to learn from."""
     trainer = Trainer("trpo", "Hopper-v5", runs=runs, steps=steps, **RUN)
@@ -414,7 +419,17 @@ def test_stopped_run_equals_uninterrupted(normalize: bool, runs: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["train", "trpo", "Hopper-v5", "--steps", "20000", "--hidden", "16", "--envs", "4"]
+    words = [
+        "train",
+        "trpo",
+        "Hopper-v5",
+        "--steps",
+        "20000",
+        "--hidden",
+        "16",
+        "--parallel-envs",
+        "4",
+    ]
     words += ["--rollout-length", "50", "--eval-every", "5000", "--eval-episodes", "1", "-q"]
     words += ["--checkpoint-every", "0.2s"]
     monkeypatch.setitem(test_kill.KILLED, "Hopper-v5", words)
@@ -450,8 +465,13 @@ def test_listed_without_a_multi_form(capsys: pytest.CaptureFixture[str]) -> None
         ("multi-trpo", {}, "members: trpo trains one member.* must stay 1, got 2"),
         ("trpo", {"rule": "none"}, "rule: trpo trains one member.* must stay best, got none"),
         ("trpo", {"replay_scope": "member"}, "replay_scope: .* must stay shared"),
+        ("trpo", {"steps": 100}, "steps: 100 are less than one rollout of 1024"),
         ("trpo", {"batch_size": 64}, "setting: unknown 'batch_size'"),
-        ("trpo", {"envs": 0}, "envs: should be greater than or equal to 1, got 0"),
+        (
+            "trpo",
+            {"parallel_envs": 0},
+            "parallel_envs: should be .* equal to 1, got 0",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_refused(name: str, settings: Any, message: str) -> None:

@@ -45,6 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        print(f"pacesetter: stopped: {error}", file=sys.stderr)
+        return 1
 
 
 def train(words: list[str]) -> int:
@@ -113,23 +116,35 @@ def evaluate(words: list[str]) -> int:
     command.add_argument("--seed", type=int, default=0, metavar="N", help="of the starts")
     command.add_argument("--noise", type=float, default=0.0, metavar="X", help="on actions")
     command.add_argument("--env", metavar="ID", help="the task, if not the one in the file")
+    command.add_argument("--env.KEY", metavar="VALUE", help="keyword of the env's constructor")
+    command.add_argument("--random", action="store_true", help="uniform actions, not the policy")
     command.add_argument("--json", action="store_true", help="print all returns as JSON")
     command.add_argument("--runs", default="runs", metavar="DIR", help="default runs")
+    words, env_kwargs = split_env_kwargs(words)
     found = command.parse(words)
     path, env = Path(found.run), found.env
     if path.suffix != ".safetensors":
         run = find(found.run, found.runs)
         path, env = run.policy_file, env or run.settings()["env"]
     policy = load(path)
-    result = evaluate(policy, env, found.episodes, found.seed, noise=found.noise)
-    about = {"env": env or policy.about.get("env"), "seed": found.seed, "noise": found.noise}
+    env = env or policy.about.get("env")
+    if env == policy.about.get("env"):
+        env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
+    acting = None if found.random else policy
+    result = evaluate(
+        acting, env, found.episodes, found.seed, noise=found.noise, env_kwargs=env_kwargs
+    )
+    about = {"env": env, "env_kwargs": env_kwargs, "seed": found.seed, "noise": found.noise}
+    source = None if found.random else str(path)
     if found.json:
-        print(json.dumps({**result.table(), **about, "policy": str(path)}))
+        print(json.dumps({**result.table(), **about, "policy": source}))
     else:
-        steps = policy.about.get("step", 0)
+        who = (
+            "uniform actions" if found.random else f"policy of step {policy.about.get('step', 0):,}"
+        )
         print(
-            f"{about['env']}: return {result.mean:.1f} +- {result.std:.1f} over {found.episodes} "
-            f"episodes of {np.mean(result.lengths):.0f} steps; policy of step {steps:,}"
+            f"{env}: return {result.mean:.1f} +- {result.std:.1f} over {found.episodes} "
+            f"episodes of {np.mean(result.lengths):.0f} steps; {who}"
         )
     return 0
 
@@ -174,6 +189,7 @@ def compare(words: list[str]) -> int:
     )
     command.add_argument("--metric", default="final", metavar="X", help="final, auc or max")
     command.add_argument("--budget", metavar="N", help="count every run up to N env steps only")
+    command.add_argument("--cpu", metavar="T", help="count every run up to that CPU time, as 10m")
     command.add_argument("--reference", default="td3", metavar="NAME", help="control; default td3")
     command.add_argument("--published", action="store_true", help="add published returns")
     command.add_argument("--mixed", action="store_true", help="allow unlike versions and budgets")
@@ -192,6 +208,7 @@ def compare(words: list[str]) -> int:
         below=found.runs,
         metric=found.metric,
         budget=found.budget,
+        cpu=found.cpu,
         reference=found.reference,
         mixed=found.mixed,
     )

@@ -152,10 +152,18 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
                 f"n_step: {hyper.n_step} with {run.members} members; "
                 f"their product must be at most {ROWS_A_TICK}"
             )
+        if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
+            raise UsageError(
+                f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
+                "(--update-at episode, --assess) would rarely meet; choose one"
+            )
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
     if isinstance(hyper, OnPolicy):
         _refuse_ensemble(run)
+        rollout = hyper.parallel_envs * hyper.rollout_length
+        if run.steps < rollout:
+            raise UsageError(f"steps: {run.steps} are less than one rollout of {rollout}")
     return Config(run, hyper)
 
 

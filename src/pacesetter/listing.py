@@ -61,8 +61,8 @@ def runs(folder: str) -> list[str]:
     for run in find_all(folder):
         try:
             step, budget, result = _state(run)
-        except UsageError as error:
-            rows.append((run.path, "-", str(error), "-"))
+        except (UsageError, KeyError, TypeError) as error:
+            rows.append((run.path, "-", f"damaged or foreign: {error}", "-"))
             continue
         rows.append((run.path, f"{step:,} of {budget:,}", _status(run, step, budget), result))
     if not rows:
@@ -72,6 +72,13 @@ def runs(folder: str) -> list[str]:
 
 def describe(run: RunDirectory) -> list[str]:
     """One run: where it stands, its last evaluations, what it spent, its settings and versions."""
+    try:
+        return _describe(run)
+    except (KeyError, TypeError) as error:
+        raise UsageError(f"{run.path}: damaged or foreign: {error}") from None
+
+
+def _describe(run: RunDirectory) -> list[str]:
     record = run.record()
     step, budget, _ = _state(run)
     rows = run.rows()

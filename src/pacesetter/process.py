@@ -14,6 +14,12 @@ def fix_threads(count: int | None = None) -> None:
     os.environ.setdefault("NPROC", str(len(os.sched_getaffinity(0))))
 
 
+def threads() -> int:
+    """How many threads this process may keep busy."""
+    cores = len(os.sched_getaffinity(0))
+    return max(int(os.environ.get("NPROC", cores)), 1)
+
+
 @contextmanager
 def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
     """The first signal calls `stop`, which lets all end cleanly; the second ends the process.

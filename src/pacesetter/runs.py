@@ -123,9 +123,12 @@ class RunDirectory:
         starts = tuple(f'{{"kind": "{kind}"' for kind in kinds) or ""
         try:
             lines = self.metrics_file.read_text().split("\n")[:-1]
-            return [json.loads(line) for line in lines if line.startswith(starts)]
+            found = [json.loads(line) for line in lines if line.startswith(starts)]
+            if not all(isinstance(row, dict) for row in found):
+                raise ValueError("a line is no row")
         except ValueError as error:
             raise UsageError(f"{self.metrics_file}: damaged: {error}") from None
+        return found
 
     def append(self, row: Row) -> None:
         """Add one line to the log."""

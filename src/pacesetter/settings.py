@@ -174,7 +174,7 @@ class OffPolicy(Hyper):
 class OnPolicy(Hyper):
     """Settings of every algorithm that learns from the rollout just made, and then drops it."""
 
-    envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
+    parallel_envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
     rollout_length: Count = Field(64, ge=1, description="steps of each env in a rollout")
     normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
 
@@ -183,7 +183,7 @@ class OnPolicy(Hyper):
 class ModelDriven(OnPolicy):
     """Settings of every algorithm that learns from all steps so far, after each rollout."""
 
-    envs: int = Field(1, ge=1, le=1000, description="envs of a rollout, stepped in turn")
+    parallel_envs: int = Field(1, ge=1, le=1000, description="envs of a rollout, stepped in turn")
     rollout_length: Count = Field(3000, ge=1, description="steps of each env in a rollout")
     replay_size: Count = Field(200_000, ge=1, description="transitions kept, oldest leave first")
     starts: int = Field(20, ge=1, description="resets an update, for imagined episodes; no steps")

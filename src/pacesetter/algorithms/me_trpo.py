@@ -19,7 +19,7 @@ from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import trpo
-from pacesetter.dynamics import Dynamics, Known, Models
+from pacesetter.dynamics import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
 from pacesetter.fitting import fit
 from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
 from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
@@ -37,6 +37,9 @@ class Hyper(ModelDriven, trpo.Hyper):
         (256, 256), min_length=1, description="widths of a model's hidden layers"
     )
     model_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the models")
+    model_noise: bool = Field(
+        False, description="models learn a deviation too, of which imagined steps draw"
+    )
     model_batch_size: int = Field(1000, ge=1, description="rows in a model's minibatch")
     model_patience: int = Field(5, ge=1, description="passes without a fall that end a fit")
     model_rows: Count = Field(250_000, ge=1, description="rows that a fit goes through at most")
@@ -251,6 +254,7 @@ def build(spec: Spec, hyper: Hyper, known: Known | None = None) -> METRPO:
         members=hyper.models,
         hidden=hyper.model_hidden,
         known=known,
+        form=GAUSSIAN if hyper.model_noise else DETERMINISTIC,
         learning_rate=hyper.model_learning_rate,
     )
     return METRPO(trpo.TRPO(spec, hyper), dynamics, hyper)

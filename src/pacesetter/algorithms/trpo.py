@@ -115,7 +115,7 @@ class TRPO:
 
     def ledger(self, updates: int, actions: int) -> dict[str, int]:
         hyper = self.hyper
-        rows = hyper.envs * hyper.rollout_length
+        rows = hyper.parallel_envs * hyper.rollout_length
         minibatches = rows // min(hyper.critic_batch_size, rows)
         return {"critic_updates": updates * hyper.critic_epochs * minibatches}
 

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as checked
 
 from pacesetter.config import build
 from pacesetter.errors import UsageError, unknown
-from pacesetter.settings import STRICT, Count
+from pacesetter.settings import STRICT, Count, Duration
 from pacesetter.study import stats
 from pacesetter.study.results import Run, gather
 from pacesetter.study.stats import Array
@@ -25,6 +25,7 @@ METRICS = {
     "max": "largest evaluation after the first update; inflated, as a maximum of noisy values is",
 }
 CONTROL = "td3"
+ANT = "pacesetter/Ant111"
 # A seed's runs may differ in these without being another group.
 _FREE = {"seed", "steps", "time", "checkpoint_every", "device"}
 _SPENT = ("steps", "updates", "transitions", "cpu", "wall")
@@ -32,9 +33,13 @@ _SPENT = ("steps", "updates", "transitions", "cpu", "wall")
 
 @checked(frozen=True, config=STRICT)
 class Limit:
-    """What `--budget` takes."""
+    """What `--budget` and `--cpu` take: env steps, or seconds of the processor."""
 
-    budget: Count = Field(ge=1)
+    budget: Count | None = Field(None, ge=1)
+    cpu: Duration | None = Field(None, gt=0)
+
+    def __str__(self) -> str:
+        return f"{self.budget:,} env steps" if self.budget else f"{self.cpu:,.0f} CPU seconds"
 
 
 @dataclass(frozen=True)
@@ -107,21 +112,24 @@ def compare(
     below: str | Path = "runs",
     metric: str = "final",
     budget: int | str | None = None,
+    cpu: float | str | None = None,
     reference: str = CONTROL,
     mixed: bool = False,
 ) -> Comparison:
     """Group runs by env and name, refusing what no table should mix unless `mixed` is set.
 
     `runs` are folders, tails or patterns of runs below a folder, or files of results. With a
-    budget, each run counts up to it only. Raises UsageError.
+    budget, or with CPU time, each run counts up to it only. Raises UsageError.
     """
     if metric not in METRICS:
         raise unknown("metric", metric, METRICS)
-    limit = None if budget is None else build(Limit, {"budget": budget}).budget
+    if budget is not None and cpu is not None:
+        raise UsageError("cpu: cuts runs at another place than --budget; give one of them")
+    limit = build(Limit, {"budget": budget, "cpu": cpu})
     found, empty = gather(runs, below)
     kept, notes = _complete(found, empty, limit)
     _refuse_twins(kept)
-    notes += _mixtures(kept, mixed)
+    notes += _mixtures(kept, mixed, limit)
     grouped: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in kept:
         grouped[run.env, run.name].append(run)
@@ -133,22 +141,26 @@ def compare(
 
 
 def split(env: str) -> tuple[str, str]:
-    """A task without its version, and the version."""
+    """A task without its version, and the version; the Ant with 111 observations is an Ant."""
+    if env.startswith(ANT):
+        task, version = split(env.replace(ANT, "Ant", 1))
+        return task, f"{version}, 111"
     found = re.fullmatch(r"(.*)-(v\d+)(.*)", env)
     return (found[1] + found[3], found[2]) if found else (env, "-")
 
 
-def _complete(found: list[Run], empty: list[str], limit: int | None) -> tuple[list[Run], list[str]]:
+def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Run], list[str]]:
     """The runs that made their budget, cut at the limit, and a note for those that did not."""
     kept: list[Run] = []
     out = [f"{source} (no evaluation)" for source in empty]
     for run in found:
-        aim = limit if limit is not None else run.planned
-        at = int(run.clock[-1])
-        if at < aim if limit is not None else not run.finished:
-            out.append(f"{run.source} ({at:,} of {aim:,} env steps)")
+        if short := _short_of(run, limit):
+            out.append(f"{run.source} ({short})")
             continue
-        run = run.cut(limit) if limit is not None else run
+        if limit.cpu:
+            run = run.within(limit.cpu)
+        elif limit.budget:
+            run = run.cut(limit.budget)
         if len(run.steps) < stats.FEWEST_EVALUATIONS:
             out.append(f"{run.source} ({len(run.steps)} evaluations, three are needed)")
         else:
@@ -157,6 +169,15 @@ def _complete(found: list[Run], empty: list[str], limit: int | None) -> tuple[li
         reason = f": {'; '.join(out[:3])}" if out else ""
         raise UsageError(f"run: none is complete{reason}; cut all with --budget, or resume them")
     return kept, [f"Left out as incomplete: {', '.join(out)}."] if out else []
+
+
+def _short_of(run: Run, limit: Limit) -> str | None:
+    """How far a run came that did not reach the limit, or without one its own budget."""
+    if limit.cpu:
+        return None if run.cpu[-1] >= limit.cpu else f"{run.cpu[-1]:,.0f} of {limit}"
+    aim, at = limit.budget or run.planned, int(run.clock[-1])
+    enough = at >= limit.budget if limit.budget else run.finished
+    return None if enough else f"{at:,} of {aim:,} env steps"
 
 
 def _refuse_twins(runs: list[Run]) -> None:
@@ -171,7 +192,7 @@ def _refuse_twins(runs: list[Run]) -> None:
         seen[key] = run
 
 
-def _mixtures(runs: list[Run], mixed: bool) -> list[str]:
+def _mixtures(runs: list[Run], mixed: bool, limit: Limit) -> list[str]:
     """Refuse several versions of a task, several budgets, or settings that differ in a group."""
     said: list[str] = []
     versions: dict[str, set[str]] = defaultdict(set)
@@ -181,7 +202,7 @@ def _mixtures(runs: list[Run], mixed: bool) -> list[str]:
         if len(several) > 1:
             said.append(f"env: {task} in the versions {', '.join(sorted(several))}")
     budgets = sorted({run.budget for run in runs})
-    if len(budgets) > 1:
+    if len(budgets) > 1 and not limit.cpu:
         shown = ", ".join(f"{budget:,}" for budget in budgets)
         said.append(f"budget: runs of {shown} env steps; --budget cuts all at one")
     said += _differing(runs)
@@ -195,22 +216,27 @@ def _differing(runs: list[Run]) -> list[str]:
     said: dict[tuple[str, str, str], str] = {}
     for run in runs:
         other = first.setdefault((run.env, run.name), run)
-        for key in sorted({*run.settings, *other.settings} - _FREE):
-            a, b = other.settings.get(key), run.settings.get(key)
+        # A setting that an older version did not have is not a difference.
+        for key in sorted((run.settings.keys() & other.settings.keys()) - _FREE):
+            a, b = other.settings[key], run.settings[key]
             if a != b:
                 said[run.env, run.name, key] = f"{run.env} {run.name} has {key} {a} and {b}"
     return list(said.values())
 
 
-def _remarks(groups: list[Group], limit: int | None) -> list[str]:
+def _remarks(groups: list[Group], limit: Limit) -> list[str]:
     """What is no reason to refuse, but to be told."""
     runs = [run for group in groups for run in group.runs]
     notes: list[str] = []
-    few = [f"{g.env} {g.name} (n={len(g.runs)})" for g in groups if len(g.runs) < 5]
+    few = [
+        f"{g.env} {g.name} (n={len(g.runs)})" for g in groups if len(g.runs) < stats.FEWEST_SEEDS
+    ]
     if few:
         notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {_few(few)}.")
-    if limit is not None:
-        notes.append(f"Every run counts up to {limit:,} env steps.")
+    if limit.budget or limit.cpu:
+        notes.append(f"Every run counts up to {limit}.")
+    if any(run.settings.get("count_selection_steps") is False for run in runs):
+        notes.append("Steps of selection come on top of the env steps where a run left them out.")
     for key, what in (("eval_every", "evaluations come at"), ("eval_episodes", "episodes differ")):
         if len({run.settings[key] for run in runs}) > 1:
             notes.append(f"Settings of the evaluation differ ({key}): {what} other numbers.")

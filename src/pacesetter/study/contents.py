@@ -115,7 +115,7 @@ def speed(comparison: Comparison) -> Table:
 
 
 def soon(reached: Array) -> Cell:
-    middle = float(np.sort(reached)[(len(reached) - 1) // 2])
+    middle = float(np.median(reached))
     arrived = int(np.isfinite(reached).sum())
     return Cell(f"{number(middle).text} ({arrived} of {len(reached)})", middle)
 

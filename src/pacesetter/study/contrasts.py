@@ -49,18 +49,18 @@ def shared(comparison: Comparison) -> dict[str, list[Array]]:
 
     A score is the metric over the task's scale in published.toml, so that tasks can be averaged.
     """
-    envs = [
-        env
+    scales = {
+        env: one
         for env in comparison.envs
         if all(comparison.find(env, name) for name in comparison.names)
-        and scale(split(env)[0]) is not None
-    ]
-    if len(envs) < 2:
+        and (one := scale(split(env)[0])) is not None
+    }
+    if len(scales) < 2:
         return {}
     return {
         name: [
-            group.values(comparison.metric) / (scale(split(env)[0]) or 1)
-            for env in envs
+            group.values(comparison.metric) / one
+            for env, one in scales.items()
             if (group := comparison.find(env, name))
         ]
         for name in comparison.names
@@ -87,7 +87,7 @@ def together(comparison: Comparison) -> list[Table]:
     notes = [
         f"Score: {comparison.metric} return over the published return of TD3 on that task after 1M "
         "steps (published.toml), only to bring tasks to one scale; it is of other env versions.",
-        "Stratified bootstrap over the runs of each task, from five seeds a task on.",
+        "Stratified bootstrap over the runs of each task, from ten seeds a task on.",
     ]
     return [Table("All tasks together", headers, rows, notes, ledger(comparison.groups))]
 

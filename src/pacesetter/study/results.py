@@ -102,6 +102,10 @@ class Run:
         settings = self.settings | {"steps": min(budget, self.planned) // self._unit}
         return replace(self, **cut, table=self.table | {"settings": settings})
 
+    def within(self, cpu: float) -> "Run":
+        """The run as it was when it had spent so many CPU seconds."""
+        return self.cut(int(self.clock[self.cpu <= cpu].max(initial=0)))
+
     def metric(self, name: str) -> float:
         """`final`, `auc` or `max`; the last is over evaluations after the first update."""
         if name == "final":

@@ -17,6 +17,7 @@ scipy: Any = scipy_stats
 
 CONFIDENCE = 0.95
 FEWEST_SEEDS = 5  # below, a result is called indicative and gets no bootstrap interval
+PERCENTILE_SEEDS = 10  # below, a percentile bootstrap is far too narrow
 FEWEST_EVALUATIONS = 3
 RESAMPLES = 10_000
 PROFILE_RESAMPLES = 2_000
@@ -122,11 +123,12 @@ def _t(value: float, error: float, freedom: float) -> tuple[float, float]:
 def iqm(tasks: Sequence[Array]) -> Interval:
     """Interquartile mean of all runs of all tasks: the mean of their middle half.
 
-    One task gets a BCa bootstrap interval, several a stratified percentile one as in Agarwal et
-    al.; none where a task has fewer than five seeds, since it would be far too narrow.
+    One task gets a BCa bootstrap interval from five seeds on, several a stratified percentile one
+    as in Agarwal et al. from ten on: below, it would be far too narrow.
     """
     value = float(_iqm(*tasks))
-    if min(len(task) for task in tasks) < FEWEST_SEEDS:
+    fewest = FEWEST_SEEDS if len(tasks) == 1 else PERCENTILE_SEEDS
+    if min(len(task) for task in tasks) < fewest:
         return Interval(value)
     if all(np.ptp(task) == 0 for task in tasks):
         return Interval(value, value, value)
@@ -144,7 +146,8 @@ def _iqm(*tasks: Array, axis: int = -1) -> Any:
 def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
     """Probability that a run of x beats one of y on a task, ties counting half, mean over tasks.
 
-    With one task this is the Mann-Whitney U statistic over n m.
+    With one task this is the Mann-Whitney U statistic over n m. The interval is a percentile
+    bootstrap from ten seeds on; where every pair has the same outcome, resampling says nothing.
     """
     rng = np.random.default_rng(0)
     value, draws = 0.0, np.zeros(RESAMPLES)
@@ -154,9 +157,8 @@ def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
         value += wins.mean() / len(pairs)
         drawn = (_weights(rng, len(x), RESAMPLES) @ wins) * _weights(rng, len(y), RESAMPLES)
         draws += drawn.sum(axis=1) / len(pairs)
-    if min(len(side) for pair in pairs for side in pair) < FEWEST_SEEDS:
-        return Interval(value)
-    return Interval(value, *_percentiles(draws))
+    few = min(len(side) for pair in pairs for side in pair) < PERCENTILE_SEEDS
+    return Interval(value) if few or np.ptp(draws) == 0 else Interval(value, *_percentiles(draws))
 
 
 def profile(tasks: Sequence[Array], levels: Array) -> tuple[Array, Array, Array]:
@@ -167,7 +169,7 @@ def profile(tasks: Sequence[Array], levels: Array) -> tuple[Array, Array, Array]
         above = (task[:, None] > levels).astype(float)
         value += above.mean(axis=0) / len(tasks)
         draws += _weights(rng, len(task), PROFILE_RESAMPLES) @ above / len(tasks)
-    if min(len(task) for task in tasks) < FEWEST_SEEDS:
+    if min(len(task) for task in tasks) < PERCENTILE_SEEDS:
         return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
     low, high = _percentiles(draws)
     return value, low, high

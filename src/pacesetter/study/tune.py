@@ -133,7 +133,7 @@ class Tuning:
             self._trainer = trainer = self._trainer_of(trial)
             with console(trainer, quiet) as sink:
                 pruned = self._train(trial, trainer, sink)
-        except TrainingError as error:
+        except (TrainingError, UsageError) as error:
             self._tell(trial, FAILED, None, str(error))
             return
         if not (pruned or trainer.finished):

@@ -21,6 +21,7 @@ from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts
 from pacesetter.policy import Floats, Policy, clip, normalize
+from pacesetter.process import threads
 from pacesetter.rules import Parents
 from pacesetter.seeding import Stream, generator
 from pacesetter.training import priorities
@@ -53,7 +54,7 @@ class Ensemble:
         self.budget = run.steps * config.unit
         self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
-        self.workers = ThreadPoolExecutor(run.members)  # a thread starts when first needed
+        self.workers = ThreadPoolExecutor(min(run.members, threads()))
         self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
         self.kept: list[Policy | None] = [None] * run.members  # the best assessed policies
         self.warmup_streams = [generator(run.seed, Stream.WARMUP, k) for k in range(run.members)]
@@ -117,6 +118,11 @@ class Ensemble:
             replay.close()
 
     @property
+    def behind(self) -> bool:
+        """Whether updates are due that did not fit into the last tick."""
+        return any(self._ready(k) for k, _ in self.progress.each())
+
+    @property
     def statistics(self) -> Statistics:
         """What observations are normalised by, now."""
         return self.normalizer.statistics()
@@ -143,12 +149,14 @@ class Ensemble:
     # Collect.
 
     def collect(self) -> None:
-        """Every member in an episode acts and steps its own env, up to the budget."""
+        """Every member in an episode that is not behind with its updates acts and steps its own
+        env, up to the budget.
+        """
         progress, warmup = self.progress, self.config.hyper.warmup
         for k, member in progress.each():
             if member.starting:
                 self._start(k, member)
-        acting = [k for k, member in progress.each() if member.active]
+        acting = [k for k, member in progress.each() if member.active and not self._ready(k)]
         for k in acting[: self.budget - progress.step]:
             action = self._random(k) if progress.step < warmup else self._explore(k)
             with blame(k, progress.step):
@@ -210,7 +218,8 @@ class Ensemble:
         self.replay(k).drawing.end(k, member.episode_return)
         learned = member.started >= self.config.hyper.warmup
         selects = run.members > 1 and run.select_on == "train"
-        member.end(counts=selects and member.started >= self.config.select_after)
+        begun = max(self.config.select_after, member.copied)
+        member.end(counts=selects and member.started >= begun)
         if self.config.hyper.assess and learned:
             self._assess(k, member)
 
@@ -316,6 +325,9 @@ class Ensemble:
         self.states = inherit(self.states, parents, self.config.run.copy)
         self.acting = self.population.acting(self.states)
         self.kept = [self.kept[parent] for parent in parents]
+        for k, parent in enumerate(parents):
+            if parent != k:  # what it earned so far in a running episode was not its new weights'
+                self.progress.members[k].copied = self.progress.step
         assessments = [self.progress.members[parent].assessment.copy() for parent in parents]
         for member, assessment in zip(self.progress.members, assessments, strict=True):
             member.assessment = replace(assessment, over=member.assessment.over)

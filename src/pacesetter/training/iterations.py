@@ -70,6 +70,8 @@ class Iterations:
         """The ring, if there is one."""
         return self.source.replays
 
+    behind = False  # an iteration makes its update
+
     def tick(self) -> None:
         """One iteration; what is left of the budget at the end is too little to learn from."""
         size = self.config.hyper.rollout_length * len(self.envs)

@@ -21,6 +21,7 @@ class Member:
     active: bool = True  # False while it waits for the others to end their episodes
     starting: bool = True  # its next tick begins an episode
     started: int = 0  # step of the run at which the episode began
+    copied: int = 0  # step of the run at which it last became another's copy
     episode_return: float = 0.0
     episode_length: int = 0
     window: list[float] = field(default_factory=list[float])  # returns since the last selection

@@ -86,7 +86,10 @@ class Replay:
         capacity: int,
         budget: int,
         drawing: Drawing | None = None,
+        tick: int | None = None,
     ) -> None:
+        """`tick` is how many rows a tick adds at most."""
+        self.tick = MEMBERS if tick is None else tick
         self.path, self.columns, self.capacity = path, columns, capacity
         self.drawing = drawing or Uniform()
         self.slots = capacity + SLACK
@@ -109,7 +112,7 @@ class Replay:
     @property
     def must_commit(self) -> bool:
         """Whether more rows would eat into what the checkpoint before the latest needs."""
-        return self.head - self.committed >= UNCOMMITTED
+        return self.head - self.committed + self.tick >= UNCOMMITTED + MEMBERS
 
     def add(
         self,

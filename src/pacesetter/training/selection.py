@@ -26,17 +26,23 @@ class Selection(NamedTuple):
     standard_error: float
 
 
-def measure(returns: Returns, variances: list[float]) -> tuple[float, float]:
+def measure(returns: Returns, variances: list[float], paired: bool) -> tuple[float, float]:
     """Best mean return minus the next, and the standard error of such a difference.
 
-    With n > 1 episodes a member, the variance is that of a member's own episodes. With one, it is
+    With n > 1 episodes a member, the variance is that of a member's own episodes; `paired` ones had
+    the same starts for each member, and what a start does to all is taken out. With one, it is
     that between the members: after a copy they are clones, so their spread is noise, and where
     they are not, the error is overstated. Either is pooled over the last 20 selections, which
     `variances` remembers.
     """
-    episodes = returns.shape[1]
+    members, episodes = returns.shape
     means = np.sort(returns.mean(axis=1))
-    spread = returns.var(axis=1, ddof=1).mean() if episodes > 1 else returns.var(ddof=1)
+    if episodes == 1:
+        spread = returns.var(ddof=1)
+    else:
+        own = returns - returns.mean(axis=1, keepdims=True)
+        own = own - own.mean(axis=0) if paired else own
+        spread = (own**2).sum() / ((members - paired) * (episodes - 1))
     variances.append(float(spread))
     del variances[:-REMEMBERED]
     error = float(np.sqrt(2 * np.mean(variances) / episodes))
@@ -51,22 +57,24 @@ def on_training(ensemble: Ensemble) -> Selection | None:
     returns = np.array([member.window[-window:] for member in members])
     for member in members:
         member.window = []
-    return _select(ensemble, returns)
+    return _select(ensemble, returns, paired=False)
 
 
 def on_trials(ensemble: Ensemble) -> Selection | None:
-    """Select on extra noise-free episodes with the same starts for each; their steps count."""
+    """Select on extra noise-free episodes with the same starts for each."""
     config, progress = ensemble.config, ensemble.progress
-    if progress.step <= config.select_after or progress.step < progress.next_selection:
+    if progress.step < progress.next_selection or progress.step >= ensemble.budget:
         return None
     every = config.run.select_every * config.unit
     returns = [ensemble.trial(k) for k in range(config.run.members)]
     progress.next_selection = (progress.step // every + 1) * every
     # A selection that the budget cut short decides nothing.
-    return _select(ensemble, np.array(returns)) if progress.step < ensemble.budget else None
+    if progress.step >= ensemble.budget:
+        return None
+    return _select(ensemble, np.array(returns), paired=True)
 
 
-def _select(ensemble: Ensemble, returns: Returns) -> Selection:
+def _select(ensemble: Ensemble, returns: Returns, paired: bool) -> Selection:
     """Copy by the rule's choice from returns (K, episodes); the winner is the champion."""
     run, progress = ensemble.config.run, ensemble.progress
     means = returns.mean(axis=1)
@@ -75,7 +83,7 @@ def _select(ensemble: Ensemble, returns: Returns) -> Selection:
         ensemble.descend(parents)
         progress.champion = champion(means, parents)
     progress.selections += 1
-    gap, error = measure(returns, progress.variances)
+    gap, error = measure(returns, progress.variances, paired)
     return Selection(parents.tolist(), progress.champion, returns.tolist(), gap, error)
 
 

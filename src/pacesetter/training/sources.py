@@ -20,7 +20,7 @@ class LastRollout:
     """The rollout just made, in time order: (T, E, width)."""
 
     def __init__(self, config: Config, columns: Columns) -> None:
-        self.envs, self.columns = config.hyper.envs, columns
+        self.envs, self.columns = config.hyper.parallel_envs, columns
         self.length = config.hyper.rollout_length
         self.replays: list[Replay] = []
 
@@ -52,14 +52,14 @@ class AllSteps:
         run, hyper = config.run, config.hyper
         self.columns, self.starts = columns, hyper.starts
         self.capacity = min(hyper.replay_size, run.steps)
-        rollout = hyper.envs * hyper.rollout_length
+        rollout = self.rollout = hyper.parallel_envs * hyper.rollout_length
         if not FEWEST <= rollout <= min(UNCOMMITTED, hyper.replay_size):
             raise UsageError(
                 f"rollout_length: a rollout of all envs must have {FEWEST} to "
                 f"{min(UNCOMMITTED, hyper.replay_size)} steps, it has {rollout}"
             )
         self.size = hyper.replay_size
-        self.env = Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, hyper.envs)
+        self.env = Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, hyper.parallel_envs)
         self.replays: list[Replay] = []
 
     def shape(self) -> Data:
@@ -70,7 +70,7 @@ class AllSteps:
 
     def open(self, path: Path, budget: int) -> None:
         """Make or find the ring."""
-        self.replays.append(Replay(path, self.columns, self.size, budget))
+        self.replays.append(Replay(path, self.columns, self.size, budget, tick=self.rollout))
 
     def keep(self, rows: Floats) -> None:
         """Put a rollout into the ring."""

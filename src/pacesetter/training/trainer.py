@@ -108,13 +108,13 @@ class Trainer:
         on_policy = isinstance(hyper, OnPolicy)
         envs = [
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
-            for index in range(hyper.envs if on_policy else run.members)
+            for index in range(hyper.parallel_envs if on_policy else run.members)
         ]
         envs[0].check()
         self.ensemble = (Iterations if on_policy else Ensemble)(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []
-        self.stopping = self._closed = False
+        self._stopping = self._closed = False
         self._clock = Clock()
 
     def __iter__(self) -> Iterator[Report]:
@@ -129,7 +129,7 @@ class Trainer:
                 self._report_what_is_due(ending)
                 reports, self._reports = self._reports, []
                 yield from reports
-                if ending or self.stopping:
+                if ending or self._stopping:
                     break
                 if self._save_is_due():
                     self.save()
@@ -154,20 +154,20 @@ class Trainer:
 
     @property
     def budget(self) -> int:
-        """Env steps in all, of every member and of selection."""
+        """Env steps in all, of every member and, where it is counted, of selection."""
         return self.ensemble.budget
 
     @property
     def finished(self) -> bool:
-        """Whether the budget of steps or time is spent."""
+        """Whether the budget of steps, with the updates they owe, or of time is spent."""
         limit = self.config.run.time
         if limit is not None and self.progress.wall_seconds >= limit:
             return True
-        return self.progress.step >= self.budget
+        return self.progress.step >= self.budget and not self.ensemble.behind
 
     def stop(self) -> None:
         """Ask for the end after the running tick; may be called from a signal handler."""
-        self.stopping = True
+        self._stopping = True
 
     def save(self) -> None:
         """Write a checkpoint now."""
@@ -220,7 +220,7 @@ class Trainer:
         """Evaluate the champion on starts of its own and write the policy files."""
         run, progress = self.config.run, self.progress
         policy = self.policy()
-        trial = self._trial(policy)
+        trial = self._trial(progress.champion)
         score = {"score": trial.mean, "score_std": trial.std, "score_episodes": run.eval_episodes}
         policy.about.update(score)
         policy.save(self.directory.policy_file)
@@ -230,16 +230,16 @@ class Trainer:
             policy.save(self.directory.best_file)
         values = trial.table() | {"champion": progress.champion}
         if ending and run.rule == "none" and run.members > 1:
-            values["members"] = [self._trial(self.policy(k)).mean for k in range(run.members)]
+            values["members"] = [self._trial(k).mean for k in range(run.members)]
         self._emit("eval", values)
 
-    def _trial(self, policy: Policy) -> Evaluation:
+    def _trial(self, member: int) -> Evaluation:
         run, progress = self.config.run, self.progress
         if self._evaluation_env is None:
             env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
             self._evaluation_env = env
-        with blame(progress.champion, progress.step):
-            return rollouts(policy.act, self._evaluation_env, run.eval_episodes)
+        with blame(member, progress.step):
+            return rollouts(self.policy(member).act, self._evaluation_env, run.eval_episodes)
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
