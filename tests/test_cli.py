@@ -293,7 +293,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "multi-td3": (
         "--steps 400 --members 3 --rule top_half --select-on eval --select-every 130 "
         "--select-window 2 --copy weights --same-init --count member --no-wait "
-        "--replay-scope member",
+        "--replay-scope member --update-every 4 --select-after 60 --no-count-selection-steps",
         {},
     ),
     "multi-ddpg": (
@@ -304,7 +304,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac": (
         "--steps 300 --hidden 8 --batch-size 8 --warmup 50 --replay return --replay-exponent 0.5 "
         "--replay-importance 0.3 --replay-horizon 1000 --replay-to-go --n-step 3 --assess 2 "
-        "--assess-after 100 --update-every 4",
+        "--assess-after 100",
         {},
     ),
     "crossq": (
@@ -472,7 +472,9 @@ def test_the_demo_saves_on_ctrl_c(runs: Path) -> None:
 
     trainer.ensemble.tick = interrupted
     assert not demo.train(trainer)
-    assert Trainer.resume(trainer.directory.path).progress.step == 51
+    resumed = Trainer.resume(trainer.directory.path)
+    resumed.close()
+    assert resumed.progress.step == 51
 
 
 def test_iterator_breaks_and_goes_on(runs: Path) -> None:

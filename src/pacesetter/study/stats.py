@@ -150,15 +150,16 @@ def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
     bootstrap from ten seeds on; where every pair has the same outcome, resampling says nothing.
     """
     rng = np.random.default_rng(0)
-    value, draws = 0.0, np.zeros(RESAMPLES)
+    value, draws, alike = 0.0, np.zeros(RESAMPLES), True
     for x, y in pairs:
         difference = x[:, None] - y
         wins = (difference > 0) + 0.5 * (difference == 0)
         value += wins.mean() / len(pairs)
+        alike = alike and np.ptp(wins) == 0
         drawn = (_weights(rng, len(x), RESAMPLES) @ wins) * _weights(rng, len(y), RESAMPLES)
         draws += drawn.sum(axis=1) / len(pairs)
     few = min(len(side) for pair in pairs for side in pair) < PERCENTILE_SEEDS
-    return Interval(value) if few or np.ptp(draws) == 0 else Interval(value, *_percentiles(draws))
+    return Interval(value) if few or alike else Interval(value, *_percentiles(draws))
 
 
 def profile(tasks: Sequence[Array], levels: Array) -> tuple[Array, Array, Array]:
