@@ -10,6 +10,7 @@ it, one by as many minibatches as there are rows, as STEVE does it.
 """
 
 import argparse
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,8 @@ def main() -> None:
     )
     heads = ["model", "error", "worst number", "of the members' mean", f"error at most {TARGET}"]
     print(tabulate(table, headers=heads, floatfmt=".4f"))
+    if any(row[-1] == "no" for row in table):
+        sys.exit(1)
 
 
 if __name__ == "__main__":

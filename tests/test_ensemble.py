@@ -501,7 +501,7 @@ class KeyTeller:
         seen = jnp.concatenate([batch.observation, batch.next_observation], axis=-1)
         return Update(Told(jax.random.key_data(key)), {"loss": jnp.zeros(())}, seen)
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Any, updates: int, actions: int) -> dict[str, int]:
         return {}
 
     def policy(self, state: Told) -> Any:

@@ -402,3 +402,21 @@ def test_imagined_steps_are_drawn_where_models_learn_noise(noise: bool) -> None:
         for number in (1, 2)
     )
     assert np.array_equal(one, other) != noise
+
+
+def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
+    """The sums of the log's own rows, one an iteration."""
+    trainer = Trainer("me-trpo", "Hopper-v5", runs=tmp_path, steps=750, **RUN)
+    searched = fitted = 0.0
+    while not trainer.finished:
+        trainer.ensemble.tick()
+        told = trainer.progress.training_values(trainer.ensemble.loss_names)
+        searched += told["policy_updates"]
+        fitted += told["model_epochs"]
+    found = trainer.ensemble.ledger()
+    trainer.close()
+    assert found["updates"] == 3
+    assert found["resets"] == 3 * SMALL["starts"]
+    assert found["policy_updates"] == searched > 0
+    assert found["model_epochs"] == fitted > 0
+    assert found["imagined_steps"] == searched * SMALL["imagined_steps"]

@@ -291,7 +291,7 @@ def test_model_use_is_what_horizon_0_does_not_get(steve: Any) -> None:
     _, weight = compiled(algorithm.target)(fitted, jax.tree.map(first, rows(1, 16)), step_key)
     np.testing.assert_allclose(weight.sum(axis=0), 1, rtol=1e-5)
     np.testing.assert_allclose(found.losses["model_use"], 1 - weight[0].mean(), rtol=1e-3)
-    ledger = algorithm.ledger(10, 99)
+    ledger = algorithm.ledger([], 10, 99)
     assert ledger == {"model_updates": 10, "imagined_transitions": 10 * 16 * 3 * 2}
 
 

@@ -3,6 +3,7 @@
 Axes: K members, U updates a cycle, B batch, T time, E environments, N networks in one learner.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -92,9 +93,9 @@ class Algorithm(Protocol):
         """One cycle of U updates."""
         ...
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
-        """What so many updates and chosen actions cost beyond themselves, for every row's ledger;
-        most learners have nothing to add.
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
+        """What so many updates and chosen actions cost the members beyond themselves, for every
+        row's ledger; most learners have nothing to add.
         """
         ...
 

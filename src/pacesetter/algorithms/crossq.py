@@ -13,6 +13,7 @@ Networks that learn normalise by their batch and move their running statistics; 
 plain networks, into whose weights the running statistics are folded.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -92,7 +93,7 @@ class CrossQ:
     def mask(self, rng: np.random.Generator) -> Floats:
         return NO_MASK
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         return {}
 
     def init(self, key: Array) -> State:

@@ -8,6 +8,7 @@ repeat, on imagined steps from real starts, each through a model drawn at random
 until none was kept for `patience` updates; go on with the policy kept last
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -61,6 +62,8 @@ class State(NamedTuple):
     learner: trpo.State
     models: Models
     updates: Array
+    searched: Array  # policy updates in all
+    fitted: Array  # passes of the models over their rows, in all
 
 
 class Search(NamedTuple):
@@ -88,7 +91,8 @@ class METRPO:
     def init(self, key: Array) -> State:
         learner_key, models_key = jax.random.split(key)
         models = self.dynamics.init(models_key)
-        return State(self.base.init(learner_key), models, jnp.zeros((), jnp.int32))
+        none = jnp.zeros((), jnp.int32)
+        return State(self.base.init(learner_key), models, none, none, none)
 
     def acting(self, state: State) -> trpo.Gaussian:
         return state.learner.actor
@@ -105,22 +109,40 @@ class METRPO:
         """One iteration on all real steps, the first `valid` of (S, ...), and reset `starts`."""
         fit_key, search_key = jax.random.split(key)
         starts: Any = batch.starts
-        models, losses = self.fit_models(state, batch, fit_key)
+        models, epochs, losses = self.fit_models(state, batch, fit_key)
         search = self.search(state.learner, models, starts, search_key)
         losses |= {"imagined_return": search.returns.mean(), "policy_updates": search.made * 1.0}
         learner = search.learner._replace(actor=search.kept)
-        return Update(State(learner, models, state.updates + 1), losses, jnp.zeros((1, 1)))
+        searched, fitted = state.searched + search.made, state.fitted + epochs
+        new = State(learner, models, state.updates + 1, searched, fitted)
+        return Update(new, losses, jnp.zeros((1, 1)))
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
-        return {"resets": updates * self.hyper.starts}
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
+        (state,), hyper = states, self.hyper
+        searched = int(state.searched)
+        return {
+            "resets": updates * hyper.starts,
+            "policy_updates": searched,
+            "imagined_steps": searched * self.imagined_envs * hyper.horizon,
+            "model_epochs": int(state.fitted),
+        }
+
+    @property
+    def imagined_envs(self) -> int:
+        """Episodes that are imagined at a time."""
+        return max(self.hyper.imagined_steps // self.hyper.horizon, 1)
 
     def policy(self, state: State) -> Actors:
         return self.base.policy(state.learner)
 
     # The pieces that `update` composes.
 
-    def fit_models(self, state: State, batch: Batch, key: Array) -> tuple[Models, dict[str, Array]]:
-        """The models after a fit to real steps, from where they are or, at times, from new ones."""
+    def fit_models(
+        self, state: State, batch: Batch, key: Array
+    ) -> tuple[Models, Array, dict[str, Array]]:
+        """The models after a fit to real steps, from where they are or, at times, from new ones,
+        and its passes.
+        """
         hyper, valid = self.hyper, jnp.asarray(batch.valid)
         models = state.models
         if hyper.renew_every:
@@ -133,10 +155,8 @@ class METRPO:
         found = fit(
             self.dynamics, models, data, key, hyper.model_batch_size, hyper.model_patience, epochs
         )
-        return found.models, {
-            "model_loss": found.loss.mean(),
-            "model_epochs": found.epochs.astype(jnp.float32),
-        }
+        losses = {"model_loss": found.loss.mean(), "model_epochs": found.epochs * 1.0}
+        return found.models, found.epochs, losses
 
     def search(self, learner: trpo.State, models: Models, starts: Array, key: Array) -> Search:
         """TRPO in the models until they no longer agree that it helps."""
@@ -176,8 +196,7 @@ class METRPO:
 
         Where an episode ends before the horizon, another begins; it is cut with the rest.
         """
-        hyper, dynamics = self.hyper, self.dynamics
-        envs = max(hyper.imagined_steps // hyper.horizon, 1)
+        hyper, dynamics, envs = self.hyper, self.dynamics, self.imagined_envs
 
         def some_starts(key: Array) -> Array:
             return starts[jax.random.randint(key, (envs,), 0, len(starts))]

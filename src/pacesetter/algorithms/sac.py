@@ -9,6 +9,7 @@ alpha is everywhere the one from before its own step, and actions stay in [-1, 1
 entropy refers to that box.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -132,7 +133,7 @@ class SAC:
         state, losses = self.fit_actor(state, minibatch, actor_key)
         return Update(state, {"critic_loss": critic_loss, **losses}, error[None])
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         return {}
 
     def policy(self, state: State) -> Actors:

@@ -149,7 +149,7 @@ class STEVE:
             losses["sigma"] = state.sigma
         return Update(state, losses, error)
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         """Steps of the models' optimiser, and imagined transitions."""
         rows = self.hyper.batch_size * self.hyper.models * self.hyper.horizon
         return {"model_updates": updates, "imagined_transitions": updates * rows}

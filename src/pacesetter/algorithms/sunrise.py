@@ -10,7 +10,7 @@
 What the paper says and what its code does differ; `FORMS` holds both.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
@@ -213,7 +213,7 @@ class Sunrise:
         found = {name: loss.mean() for name, loss in actor_losses.items()}
         return Update(state, {"critic_loss": losses.mean()} | found | report(*backup), error)
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         size = self.hyper.ensemble
         passes = self.inference.passes(size, self.hyper.critics)
         return {"ensemble_updates": size * updates, "ucb_passes": passes * actions}

@@ -7,7 +7,7 @@ move the actor up critic 1 on the last minibatch
 move all targets a little towards their networks
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Annotated, Any, NamedTuple
@@ -141,7 +141,7 @@ class TD3:
             losses["sigma"] = state.sigma
         return Update(state, losses, error)
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         return {}
 
     def policy(self, state: State) -> Actors:

@@ -7,7 +7,7 @@ move the actor by c^j sqrt(2 max_kl / x'(F + damping)x) x, for the first of j = 
 fit V to V + A
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -113,7 +113,7 @@ class TRPO:
         state = state._replace(actor=actor, updates=state.updates + 1)
         return Update(state, {"critic_loss": critic_loss, **losses}, jnp.abs(advantage))
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         hyper = self.hyper
         rows = hyper.parallel_envs * hyper.rollout_length
         minibatches = rows // min(hyper.critic_batch_size, rows)

@@ -131,7 +131,7 @@ class Ensemble:
         """What the run has spent."""
         progress = self.progress
         actions = sum(member.actions for member in progress.members)
-        return progress.ledger() | self.algorithm.ledger(progress.updates, actions)
+        return progress.ledger() | self.algorithm.ledger(self.states, progress.updates, actions)
 
     def policy(self, member: int) -> Policy:
         """A member's policy: the best that was assessed, if any was, or as it is now."""

@@ -96,7 +96,7 @@ class Iterations:
         """What the run has spent."""
         progress = self.progress
         actions = sum(member.actions for member in progress.members)
-        extra = self.algorithm.ledger(progress.updates, actions)
+        extra = self.algorithm.ledger(self.states, progress.updates, actions)
         return progress.ledger() | {"member_steps": [progress.step]} | extra
 
     def policy(self, member: int) -> Policy:
