@@ -1,7 +1,6 @@
 """Multi-layer perceptrons as plain pytrees: a tuple of layers, each a dict of arrays."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -91,23 +90,18 @@ def outputs(network: Network, observation: Array, action: Array, action_layer: i
     return apply(network[action_layer:], jnp.concatenate([x, action], axis=-1))
 
 
-def critic(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
-    """Value (...) of an action by a critic with one output."""
-    return outputs(network, observation, action, action_layer)[..., 0]
-
-
-def critics(networks: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
-    """Values (N, B) of N critics with one output each, for one batch."""
-    return each(partial(critic, action_layer=action_layer), networks, observation, action)
-
-
 def each(one: Callable[..., Any], networks: Network, *inputs: Array) -> Any:
     """`one(network, *inputs)` of N networks, whose leaves carry a leading axis of N."""
-    count = networks[0]["kernel"].shape[0]
-    # Each network gets inputs of its own: from shared ones XLA makes one wide product whose result
-    # it then has to transpose, which costs 5% of an update.
-    own = jax.tree.map(lambda x: jnp.stack([x] * count), inputs)
-    return jax.vmap(one)(networks, *jax.lax.optimization_barrier(own))
+    return jax.vmap(one)(networks, *apart(networks[0]["kernel"].shape[0], inputs))
+
+
+def apart(count: int, inputs: Any) -> Any:
+    """Inputs of their own for each of `count` networks.
+
+    From shared ones XLA makes one wide product whose result it then has to transpose, which costs
+    5% of an update.
+    """
+    return jax.lax.optimization_barrier(jax.tree.map(lambda x: jnp.stack([x] * count), inputs))
 
 
 def descend(

@@ -144,7 +144,8 @@ class CrossQ:
 
     def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B), by its running statistics."""
-        return nets.critics(jax.vmap(renorm.fold)(critic), observation, action)
+        folded = jax.vmap(renorm.fold)(critic)
+        return nets.each(nets.outputs, folded, observation, action)[..., 0]
 
     # The pieces that `update` composes.
 

@@ -21,6 +21,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
+from pacesetter import nets
 from pacesetter.algorithm import Array, Batch, Spec, State, Update
 from pacesetter.algorithms import sac
 from pacesetter.algorithms.td3 import UNROLLED
@@ -100,7 +101,7 @@ Ask = Callable[[Any, Array, Array], Array]
 def at_each_action(ask: Ask, critic: Any, observation: Array, action: Array) -> tuple[Array, Array]:
     """Values of member i at its own action (N, critics, B); of all at i's (N, critics, N, B)."""
     everyone = jax.vmap(ask)
-    values = [everyone(critic, *_apart(len(action), (observation, one))) for one in action]
+    values = [everyone(critic, *nets.apart(len(action), (observation, one))) for one in action]
     own = jnp.stack([value[i] for i, value in enumerate(values)])
     return own, jnp.stack(values, axis=2)
 
@@ -272,11 +273,6 @@ def report(deviation: Array, weight: Array) -> dict[str, Array]:
     bins = jnp.clip(jnp.floor((weight - 0.5) * 2 * BINS), 0, BINS - 1)
     names = [f"backup_weight_0.{5 + i}" for i in range(BINS)]
     return found | {name: (bins == i).mean() for i, name in enumerate(names)}
-
-
-def _apart(count: int, inputs: Any) -> Any:
-    """Inputs of their own for each of `count` networks: see `nets.critics`."""
-    return jax.lax.optimization_barrier(jax.tree.map(lambda x: jnp.stack([x] * count), inputs))
 
 
 def _for_rows(network: Any) -> Any:

@@ -51,6 +51,7 @@ class Ensemble:
         self.acting = self.population.acting(self.states)
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
+        self.unchanged = self.normalizer.statistics()
         self.budget = run.steps * config.unit
         self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
@@ -125,7 +126,7 @@ class Ensemble:
     @property
     def statistics(self) -> Statistics:
         """What observations are normalised by, now."""
-        return self.normalizer.statistics()
+        return self.normalizer.statistics() if self.population.normalize else self.unchanged
 
     def ledger(self) -> dict[str, Any]:
         """What the run has spent."""

@@ -60,7 +60,7 @@ class Population:
         self,
         state: State,
         member: int,
-        tick: int,
+        cycle: int,
         rows: Floats,
         weight: Floats | None,
         statistics: Statistics,
@@ -71,7 +71,7 @@ class Population:
         `extra` are fields of the batch that are not in rows. Members may be called from threads.
         """
         inputs = (rows, weight, statistics, extra or {})
-        state, losses, error, acting = self._update(state, member, tick, *inputs, self.key)
+        state, losses, error, acting = self._update(state, member, cycle, *inputs, self.key)
         return Cycle(state, np.asarray(losses), error, acting)  # NumPy waits for the result
 
     def loss_names(
@@ -102,7 +102,7 @@ class Population:
         self,
         state: State,
         member: int,
-        tick: int,
+        cycle: int,
         rows: Array,
         weight: Array | None,
         statistics: Any,
@@ -110,7 +110,7 @@ class Population:
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
-        update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, tick, member))
+        update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, cycle, member))
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
         acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
@@ -157,7 +157,7 @@ def _descend(own: Any, parent: Any, copy: str) -> Any:
     return jax.tree.map(jnp.copy, new)  # updates use up their state, so no two may share a buffer
 
 
-def _key(key: Array, draw: Draw, tick: Any, member: Any) -> Array:
-    for number in (int(draw), tick, member):
+def _key(key: Array, draw: Draw, cycle: Any, member: Any) -> Array:
+    for number in (int(draw), cycle, member):
         key = jax.random.fold_in(key, number)
     return key
