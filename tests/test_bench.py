@@ -31,7 +31,6 @@ from pacesetter.study.suite import Job, expand, load
 from pacesetter.training.trainer import Trainer
 
 PROBE = "broken_envs:Probe-v0"
-LATE = {"sunrise", "trpo", "crossq"}  # other branches bring them; skipped until then
 SMALL: dict[str, Any] = {
     "hidden": [16, 16],
     "batch_size": 16,
@@ -93,10 +92,7 @@ def parsed(words: list[str]) -> Config:
 @pytest.mark.parametrize(("name", "entry"), [*entries()])
 def test_every_entry_settles(name: str, entry: str) -> None:
     """And its command line says the same."""
-    table = load(name)
-    if (missing := table.entries[entry].get("algorithm", entry)) in LATE - {*algorithms.names()}:
-        pytest.skip(f"{missing} is not here yet")
-    found = expand(suite.pick(table, [entry]), {}, "runs")
+    found = expand(suite.pick(load(name), [entry]), {}, "runs")
     assert found
     for job in found:
         if job.config.run.seed == 0:
@@ -104,19 +100,22 @@ def test_every_entry_settles(name: str, entry: str) -> None:
         assert job.directory.path.parts[-2:] == (entry, str(job.config.run.seed))
 
 
-def known_jobs(name: str) -> list[Job]:
-    table = load(name)
-    own = {key: entry.get("algorithm", key) for key, entry in table.entries.items()}
-    return expand(suite.pick(table, [k for k, a in own.items() if a not in LATE]), {}, "runs")
+BASES = {("sac", 1, "", 1), ("sunrise", 1, "", 1)}
 
 
 @pytest.mark.parametrize(
-    ("name", "budget"), [("paper-table-1", 200_000), ("paper-table-2", 1_000_000)]
+    ("name", "budget", "warmup", "others"),
+    [("paper-table-1", 200_000, 10_000, BASES), ("paper-table-2", 1_000_000, 25_000, set())],
 )
-def test_papers_tables_have_every_control(name: str, budget: int) -> None:
-    """td3 for twice the budget, with two updates; selection none and random; on all three tasks."""
+def test_papers_tables_have_every_control(
+    name: str, budget: int, warmup: int, others: set[Any]
+) -> None:
+    """td3 for twice the budget, with two updates; selection none and random; on all three tasks.
+
+    Table I has SUNRISE and its base too; everyone has the same warm-up.
+    """
     tasks = {"pacesetter/Ant111-v4", "HalfCheetah-v4", "Walker2d-v4"}
-    runs = [(job.config.run, job.config.hyper) for job in known_jobs(name)]
+    runs = [(job.config.run, job.config.hyper) for job in expand(load(name), {}, "runs")]
     assert {run.env for run, _ in runs} == tasks
     for env in tasks:
         for seed in range(3):
@@ -125,7 +124,7 @@ def test_papers_tables_have_every_control(name: str, budget: int) -> None:
                 (r.algorithm, r.members, r.rule if r.members > 1 else "", h.updates_per_step)
                 for r, h in here
             }
-            assert seen - {("sac", 1, "", 1)} == {
+            assert seen == others | {
                 ("td3", 1, "", 1),
                 ("td3", 1, "", 2),
                 ("td3", 2, "best", 1),
@@ -133,10 +132,11 @@ def test_papers_tables_have_every_control(name: str, budget: int) -> None:
                 ("td3", 2, "random", 1),
             }
             assert {r.name: r.steps for r, _ in here if r.steps != budget} == {"td3": 2 * budget}
+            assert {h.warmup for _, h in here} == {warmup}
 
 
 def test_pilot() -> None:
-    runs = [job.config.run for job in known_jobs("pilot")]
+    runs = [job.config.run for job in expand(load("pilot"), {}, "runs")]
     steps = {run.name: run.steps for run in runs}
     assert steps == {
         "td3": 100_000,
@@ -146,11 +146,13 @@ def test_pilot() -> None:
         "multi-td3-random": 100_000,
         "td3-norm": 100_000,
         "multi-td3-norm": 100_000,
+        "sunrise-30k": 30_000,
         "sac-30k": 30_000,
         "td3-30k": 30_000,
     }
     assert {run.env for run in runs} == {"HalfCheetah-v4"}
-    assert suite.count(load("pilot")) == 7 * 3 + 3 * 2
+    assert {run.algorithm for run in runs if run.name == "sunrise-30k"} == {"sunrise"}
+    assert len(runs) == suite.count(load("pilot")) == 7 * 3 + 3 * 2
 
 
 def test_flags_over_entry_over_file_over_suite(here: Path) -> None:
