@@ -108,6 +108,54 @@ def test_fisher_product_equals_hessian_of_kl(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(found, hessian, atol=1e-4 * float(jnp.abs(hessian).max()))
 
 
+def test_conjugate_gradients_solve_a_system_in_dim_steps(rng: np.random.Generator) -> None:
+    """In float64 to 1e-6; after half of the steps the solution is still far off."""
+    with jax.enable_x64(True):
+        basis, _ = np.linalg.qr(rng.normal(size=(12, 12)))
+        matrix, right = basis * np.geomspace(1, 100, 12) @ basis.T, rng.normal(size=12)
+        expected = np.linalg.solve(matrix, right)
+        errors = []
+        for steps in (6, 12):
+            found, _ = trpo.cg(lambda x: jnp.array(matrix) @ x, right, tol=1e-12, maxiter=steps)
+            errors.append(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+    assert errors[1] < 1e-6 < 1e-2 < errors[0]
+
+
+def test_step_is_along_the_natural_gradient(rng: np.random.Generator) -> None:
+    """In float64, with as many steps as parameters: (F + damping)^-1 g, solved by elimination."""
+    batch = rollout(3, T=100)
+    rows = (batch.observation, batch.action, batch.reward)
+    with jax.enable_x64(True):
+        algorithm = learner(hidden=(3,), gradient_steps=22, damping=0.1)
+        actor = algorithm.init(jax.random.key(0)).actor
+        actor = jax.tree.map(lambda x: np.asarray(x + 0.3 * rng.normal(size=x.shape)), actor)
+        observation, action, advantage = (
+            np.asarray(x, np.float64).reshape(300, *x.shape[2:]) for x in rows
+        )
+        parameters, unravel = ravel_pytree(actor)
+        assert len(parameters) == 22
+
+        def distribution(parameters: Any) -> trpo.Moments:
+            return trpo.moments(unravel(parameters), observation)
+
+        def surrogate(parameters: Any) -> Any:  # its gradient where the ratio is 1
+            return (trpo.log_probability(distribution(parameters), action) * advantage).mean()
+
+        @jax.jit
+        def slopes(parameters: Any) -> Any:
+            product = trpo.fisher_product(distribution, parameters)
+            return jax.grad(surrogate)(parameters), jax.vmap(product)(jnp.eye(22))
+
+        gradient, fisher = jax.device_get(slopes(parameters))
+        moved, losses = jax.jit(algorithm.fit_actor)(actor, observation, action, advantage)
+        step = np.asarray(ravel_pytree(moved)[0] - parameters)
+    assert losses["accepted"] == 1
+    natural = np.linalg.solve(fisher + algorithm.hyper.damping * np.eye(22), gradient)
+    step, natural, gradient = (x / np.linalg.norm(x) for x in (step, natural, gradient))
+    np.testing.assert_allclose(step, natural, atol=1e-4)
+    assert np.abs(step - gradient).max() > 0.1
+
+
 def test_small_step_has_the_kl_that_is_allowed() -> None:
     """Where KL is quadratic and next to nothing damps, the whole step lies on the bound."""
     algorithm = learner(
