@@ -184,6 +184,17 @@ def halved(tree: Any) -> Any:
     )
 
 
+def test_learners_begin_as_they_should() -> None:
+    """Twins apart, in each layer; running statistics 0 and 1; alpha 1."""
+    state = jax.jit(learner().init)(KEY)
+    for layer in state.critic:
+        assert np.all(layer["kernel"][0] != layer["kernel"][1])
+    for layer in (*state.actor, *state.critic):
+        assert not np.any(layer["mean"])
+        assert np.all(layer["variance"] == 1)
+    assert state.log_alpha == 0
+
+
 def test_actor_moves_once_in_three(rng: np.random.Generator) -> None:
     """A cycle is three critic steps, then one of the actor and the temperature; no targets."""
     algorithm = learner(policy_delay=3)
