@@ -164,6 +164,19 @@ def test_run_killed_often_equals_undisturbed(
     assert_same(only_run(tmp_path / "whole"), directory)
 
 
+@pytest.mark.slow
+def test_killed_run_with_models_equals_undisturbed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """STEVE's models, their optimiser and the rows that each learns from go on as they were."""
+    words = ["train", "multi-steve-td3", "Hopper-v5", "--steps", "4000", *FLAGS]
+    words += ["--model-hidden", "8", "--head-hidden", "8", "--critic-members", "2"]
+    monkeypatch.setitem(KILLED, "Hopper-v5", words)
+    killed = kill_and_resume("Hopper-v5", tmp_path, kills=3, seed=1)
+    assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
+    assert_same(only_run(tmp_path / "whole"), killed)
+
+
 # Signals.
 
 
