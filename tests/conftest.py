@@ -1,8 +1,10 @@
 """What the tests share: short runs, their logs without clocks, and the exact content of a run."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -62,6 +64,14 @@ def _keep_compiled() -> None:
 def runs(tmp_path: Path) -> Path:
     """Where a test's runs lie."""
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def nans_raise() -> Iterator[None]:
+    """JAX raises where a NaN arises; in every thread, unlike in the context of `debug_nans`."""
+    jax.config.update("jax_debug_nans", True)
+    yield
+    jax.config.update("jax_debug_nans", False)
 
 
 @pytest.fixture

@@ -1,17 +1,20 @@
 """CrossQ: batch renorm by its definition, a second CrossQ in NumPy, and what acts."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
+from conftest import TINY, run_to_end
 from numeric import KEY, close, member, mlp, random_batch, random_state, slopes, squashed
 from pacesetter import renorm
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import crossq
 from pacesetter.config import settle
 from pacesetter.policy import Policy, unstack
+from pacesetter.training.trainer import Trainer
 
 train, fold, renormalize = (jax.jit(f) for f in (renorm.train, renorm.fold, renorm.renormalize))
 SPEC = Spec(observation_size=3, action_size=2)
@@ -229,6 +232,14 @@ def test_learner_uses_no_key_twice(rng: np.random.Generator) -> None:
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(algorithm.init), KEY)
         jax.eval_shape(jax.jit(algorithm.update), state, batch, KEY)
+
+
+def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
+    """A short run, from an empty replay through batch norm and renorm."""
+    settings = {**TINY, "critic_hidden": (16, 16), "warmup": 20, "steps": 80, "renorm_after": 30}
+    trainer = Trainer("crossq", "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["step"] == 80
+    assert trainer.ensemble.states[0].updates == 60
 
 
 # What acts, and the presets.

@@ -13,7 +13,7 @@ from scipy.stats import chisquare
 import test_kill
 from conftest import assert_same, log, run_to_end
 from pacesetter import config
-from pacesetter.algorithm import Spec
+from pacesetter.algorithm import Batch, Spec
 from pacesetter.algorithms import me_trpo, trpo
 from pacesetter.cli import main
 from pacesetter.config import settle
@@ -336,6 +336,31 @@ def test_probe_is_learned_in_learned_models(runs: Path) -> None:
     trainer = Trainer("me-trpo", "probe_envs:ActionReward-v0", runs=runs, **settings)
     run_to_end(trainer)
     np.testing.assert_allclose(trainer.policy().act(np.zeros(1)), 0.5, atol=0.15)
+
+
+# JAX's own checks.
+
+
+@pytest.mark.parametrize("renew_every", [0, 1])
+def test_no_key_is_used_twice(renew_every: int) -> None:
+    """With learned rewards and ends, and with networks that are drawn anew."""
+    algorithm = learner(known=None, renew_every=renew_every)
+    flat = jnp.zeros(300)
+    batch = Batch(
+        observation=flat[:, None],
+        action=flat[:, None],
+        reward=flat,
+        next_observation=flat[:, None],
+        discount=flat,
+        last=flat,
+        weight=flat,
+        mask=jnp.zeros((300, 0)),
+        starts=jnp.zeros((5, 1)),
+        valid=jnp.array(300),
+    )
+    with jax.debug_key_reuse(True):
+        state = jax.eval_shape(jax.jit(algorithm.init), jax.random.key(0))
+        jax.eval_shape(jax.jit(algorithm.update), state, batch, jax.random.key(0))
 
 
 # Refusals.

@@ -1,6 +1,7 @@
 """SAC: golden numbers, a second SAC in NumPy with derivatives by differences, and what acts."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conftest import TINY, run_to_end
 from numeric import (
     KEY,
     close,
@@ -23,6 +25,7 @@ from pacesetter import nets
 from pacesetter.algorithm import Spec
 from pacesetter.algorithms import sac
 from pacesetter.policy import Policy, unstack
+from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
 NETWORKS = ("actor", "critic", "target_critic")
@@ -202,6 +205,14 @@ def test_a_learner_uses_no_key_twice(rng: np.random.Generator) -> None:
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(algorithm.init), KEY)
         jax.eval_shape(jax.jit(algorithm.update), state, batch, KEY)
+
+
+def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
+    """A short run, from an empty replay through selections of two members."""
+    settings = {**TINY, "warmup": 20, "steps": 80}
+    trainer = Trainer("multi-sac", "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["step"] == 80
+    assert all(state.updates >= 20 for state in trainer.ensemble.states)
 
 
 # What acts.

@@ -336,12 +336,11 @@ def test_no_key_is_used_twice() -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_nan(runs: Path) -> None:
+def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
     """A short run, from an empty replay through selections of two members."""
     settings = {**TINY, "warmup": 20, "steps": 80, "model_hidden": (8,), "head_hidden": (6,)}
-    with jax.debug_nans(True):
-        trainer = Trainer("multi-steve-td3", "probe_envs:Scripted-v0", runs=runs, **settings)
-        last = run_to_end(trainer).rows()[-1]
+    trainer = Trainer("multi-steve-td3", "probe_envs:Scripted-v0", runs=runs, **settings)
+    last = run_to_end(trainer).rows()[-1]
     assert (last["step"], last["model_updates"]) == (80, last["updates"])
 
 

@@ -541,6 +541,17 @@ def test_an_ensemble_uses_no_key_twice(name: str) -> None:
         jax.eval_shape(jax.jit(ours.update), state, batch, KEY)
 
 
+@pairs
+def test_nothing_is_nan(name: str, reference: Any, runs: Path, nans_raise: None) -> None:
+    """A short run, from an empty replay on, with masks that leave learners without rows."""
+    settings = {**TINY, "batch_size": 2, "hidden": (8,), "warmup": 20, "steps": 80}
+    settings |= {"ensemble": 3, "mask_probability": 0.1, "update_every": 10}
+    settings["reference"] = reference
+    trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["step"] == 80
+    assert np.all(trainer.ensemble.states[0].updates == 60)
+
+
 @both
 def test_settings_of_the_base_keep_their_defaults(name: str) -> None:
     """Such as SAC's warm-up of 10k; only the exploration of TD3's proposals is fixed."""

@@ -654,10 +654,9 @@ def test_a_learner_uses_no_key_twice(name: str, minibatches: Minibatches) -> Non
     ("name", "settings"),
     [("multi-td3", {}), ("ddpg", {"exploration": "ou", "members": 2, "rule": "none"})],
 )
-def test_nothing_is_nan(name: str, settings: dict[str, Any], runs: Path) -> None:
+def test_nothing_is_nan(name: str, settings: dict[str, Any], runs: Path, nans_raise: None) -> None:
     """A short run, from an empty replay through selections, under JAX's check of NaN."""
     settings = {**TINY, "warmup": 20, "steps": 80, **settings}
-    with jax.debug_nans(True):
-        trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
-        assert run_to_end(trainer).rows()[-1]["step"] == 80
+    trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["step"] == 80
     assert all(state.updates >= 20 for state in trainer.ensemble.states)

@@ -503,6 +503,23 @@ def test_listed_without_a_multi_form(capsys: pytest.CaptureFixture[str]) -> None
     assert "multi-trpo" not in words
 
 
+# JAX's own checks.
+
+
+def test_no_key_is_used_twice() -> None:
+    algorithm = learner()
+    with jax.debug_key_reuse(True):
+        state = jax.eval_shape(jax.jit(algorithm.init), jax.random.key(0))
+        jax.eval_shape(jax.jit(algorithm.update), state, rollout(0), jax.random.key(0))
+
+
+def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
+    """Thirty updates of a short run."""
+    settings = {**RUN, "parallel_envs": 2, "steps": 40 * 30}
+    trainer = Trainer("trpo", "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["updates"] == 30
+
+
 # Refusals.
 
 
