@@ -39,6 +39,10 @@ CROSSQ = NO_ENTROPY | {
 }
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
+# Actions of all kinds are seen early; later noise would keep a policy for its luck.
+ASSESSED = {"assess": 5, "assess_after": 0, "warmup": 500, "steps": 1_500, "exploration_noise": 0.1}
+# Blocks of the usual 1,000 steps would leave it with the first policy to the end.
+OFFICIAL = {"reference": "official", "update_every": 100, "warmup": 500, "steps": 1_500}
 MODELS = {"model_hidden": (32,), "head_hidden": (16,), "critic_members": 2}
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": ("td3", {}),
@@ -50,7 +54,11 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "sac-quantiles": ("sac", NO_ENTROPY | {"quantiles": 25}),
     "parameter": ("td3", NOISY),
     "ddpg-parameter": ("ddpg", NOISY),
+    "ou": ("td3", {"exploration": "ou"}),
+    "ddpg-ou": ("ddpg", {"exploration": "ou"}),
+    "assess": ("td3", ASSESSED),
     "sunrise": ("sunrise", NO_ENTROPY | FEW),
+    "sunrise-official": ("sunrise", NO_ENTROPY | FEW | OFFICIAL),
     "sunrise-td3": ("sunrise-td3", FEW),
     "steve": ("steve", MODELS | {"exploration_noise": 2.0}),
     "steve-td3": ("steve-td3", MODELS),
@@ -65,7 +73,7 @@ def kinds(*quick: str) -> Any:
 
 
 both = kinds("td3", "ddpg")
-every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter")
+every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter", "ou", "assess")
 
 
 def learn(
@@ -164,6 +172,9 @@ def test_a_fall_is_the_end_of_the_task(algorithm: str, runs: Path) -> None:
 
 # Other rows, drawn otherwise.
 
+learners = pytest.mark.parametrize(
+    "algorithm", ["td3", pytest.param("sac", marks=pytest.mark.slow)]
+)
 DRAWS: dict[str, dict[str, Any]] = {
     "prioritized": {"replay": "prioritized"},
     "lap": {"replay": "lap"},
@@ -172,26 +183,30 @@ DRAWS: dict[str, dict[str, Any]] = {
 }
 
 
+@learners
 @pytest.mark.parametrize("kind", DRAWS)
-def test_every_replay_learns_the_same(kind: str, runs: Path) -> None:
+def test_every_replay_learns_the_same(kind: str, algorithm: str, runs: Path) -> None:
     """How rows are drawn moves no fixed point: reward -4 (a - s/2)^2 for s = -1 or 1."""
-    trainer = learn("td3", "BothReward-v0", runs, DRAWS[kind])
+    trainer = learn(algorithm, "BothReward-v0", runs, DRAWS[kind])
     near(trainer.policy()(np.array([[-1], [1]])), [[-0.5], [0.5]])
     near(values(trainer, -1, [-0.5]), 0)
     near(values(trainer, 1, [0.5]), 0)
 
 
+@learners
 @pytest.mark.parametrize("n", [2, 3, 7])
-def test_rows_of_several_steps_up_to_a_fall(n: int, runs: Path) -> None:
+def test_rows_of_several_steps_up_to_a_fall(n: int, algorithm: str, runs: Path) -> None:
     """The same values as with one step, from rows that end at the fall or before it."""
-    trainer = learn("td3", "Corridor-v0", runs, {"n_step": n}, falls_at=3)
+    trainer = learn(algorithm, "Corridor-v0", runs, {"n_step": n}, falls_at=3)
     for seen, value in enumerate([1.75, 1.5, 1]):
         near(values(trainer, seen), value)
 
 
-def test_rows_of_several_steps_up_to_a_cut(runs: Path) -> None:
+@learners
+def test_rows_of_several_steps_up_to_a_cut(algorithm: str, runs: Path) -> None:
     """Rows of 3, 2 and 1 steps all bootstrap: reward 1 for ever is worth 2."""
-    trainer = learn("td3", "Corridor-v0", runs, {"n_step": 3}, blind=True, max_episode_steps=3)
+    kwargs = {"blind": True, "max_episode_steps": 3}
+    trainer = learn(algorithm, "Corridor-v0", runs, {"n_step": 3}, **kwargs)
     near(values(trainer, 0), 2)
 
 
