@@ -49,14 +49,18 @@ def test_it_learns_and_its_policy_file_acts(runs: Path) -> None:
     [
         {},
         {"members": 2, "copy": "weights", "normalize_observation": True},
-        {"members": 2, "copy": "actor", "replay": "prioritized", "n_step": 3},
+        pytest.param(
+            {"members": 2, "copy": "actor", "replay": "prioritized", "n_step": 3},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["alone", "weights", "actor"],
 )
 def test_stopped_run_equals_uninterrupted(settings: dict[str, Any], runs: Path) -> None:
+    settings = {"steps": 500, **settings}
     whole = run_to_end(start(runs, name="whole", **settings))
     stopped = start(runs, name="stopped", **settings)
-    for tick in (60, 250):
+    for tick in (60, 150):
         stop_at(stopped, tick)
         assert not stopped.finished
         stopped = Trainer.resume(stopped.directory.path)
