@@ -341,10 +341,10 @@ def test_probe_is_learned_in_learned_models(runs: Path) -> None:
 # JAX's own checks.
 
 
-@pytest.mark.parametrize("renew_every", [0, 1])
-def test_no_key_is_used_twice(renew_every: int) -> None:
-    """With learned rewards and ends, and with networks that are drawn anew."""
-    algorithm = learner(known=None, renew_every=renew_every)
+@pytest.mark.parametrize(("renew_every", "noise"), [(0, False), (1, False), (1, True)])
+def test_no_key_is_used_twice(renew_every: int, noise: bool) -> None:
+    """With learned rewards and ends, with networks drawn anew, with noise in the models."""
+    algorithm = learner(known=None, renew_every=renew_every, model_noise=noise)
     flat = jnp.zeros(300)
     batch = Batch(
         observation=flat[:, None],

@@ -122,3 +122,9 @@ def test_commands_know_it_from_its_file_alone(tmp_path: Path) -> None:
     words = ["--algos", "bare:Plain", "--envs", "Pendulum-v1", "--steps=300", "--runs=more"]
     run("bench", *words, *flags, "-q")
     assert "300 of 300" in run("list", "runs", "--runs", "more")
+
+
+def test_ensemble_of_a_foreign_algorithm_has_its_own_name() -> None:
+    run, _ = settle("multi-third_party:Plain", "Pendulum-v1")
+    assert (run.algorithm, run.members, run.rule) == ("third_party:Plain", 2, "best")
+    assert run.name == "multi-third_party-Plain"

@@ -71,11 +71,11 @@ class Plain:
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         rows = jax.tree.map(lambda x: x[0], batch)
         following = nets.actor(state.actor, rows.next_observation)
-        value = nets.critic(state.critic, rows.next_observation, following)
+        value = nets.outputs(state.critic, rows.next_observation, following)[..., 0]
         y = jax.lax.stop_gradient(rows.reward + rows.discount * value)
 
         def critic_loss(critic: nets.Network) -> tuple[Array, Array]:
-            error = nets.critic(critic, rows.observation, rows.action) - y
+            error = nets.outputs(critic, rows.observation, rows.action)[..., 0] - y
             return (rows.weight * error**2).mean(), jnp.abs(error)
 
         (loss, error), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic)
@@ -85,14 +85,14 @@ class Plain:
 
         def actor_loss(actor: nets.Network) -> Array:
             action = nets.actor(actor, rows.observation)
-            return -nets.critic(critic, rows.observation, action).mean()
+            return -nets.outputs(critic, rows.observation, action)[..., 0].mean()
 
         lack, slope = jax.value_and_grad(actor_loss)(state.actor)
         actor, actor_moments = nets.descend(self._adam, state.actor, slope, state.actor_optimizer)
         state = State(actor, critic, actor_moments, critic_moments, state.updates + 1)
         return Update(state, {"critic_loss": loss, "actor_loss": lack}, error[None])
 
-    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+    def ledger(self, states: Any, updates: int, actions: int) -> dict[str, int]:
         return {"plain_updates": updates}
 
     def policy(self, state: State) -> Actors:

@@ -106,7 +106,8 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
         base, layers = preset_layers(table.pop("algorithm"), env)
         shared = {key: value for key, value in table.items() if key not in ("help", "source")}
         return base, [*layers, shared, *(t for p, t in by_env.items() if fnmatchcase(env, p))]
-    if name.startswith("multi-") and name[6:] in {*algorithms.names(), *known}:
+    several = name.startswith("multi-")
+    if several and (":" in name or name[6:] in {*algorithms.names(), *known}):
         base, layers = preset_layers(name.removeprefix("multi-"), env)
         return base, [*layers, {"members": 2, "rule": "best"}]
     if name not in algorithms.names() and ":" not in name:

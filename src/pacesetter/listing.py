@@ -13,12 +13,12 @@ SHOWN_EVALUATIONS = 5
 
 def algorithms() -> list[str]:
     """Algorithms and what each is, with the ensemble form of each."""
-    from pacesetter.algorithms import TABLE, alone, plugins
+    from pacesetter.algorithms import TABLE, alone, names, plugins
 
     rows = [(name, entry.help) for name, entry in TABLE.items()]
-    several = [name for name in TABLE if not alone(name)]
-    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
     rows += [(name, target) for name, target in plugins().items()]
+    several = [name for name in names() if not alone(name)]
+    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
     return _table(rows)
 
 

@@ -147,7 +147,8 @@ class METRPO:
         models = state.models
         if hyper.renew_every:
             due = state.updates % hyper.renew_every == 0
-            new = self.dynamics.init(jax.random.fold_in(key, 1))
+            new_key, key = jax.random.split(key)
+            new = self.dynamics.init(new_key)
             models = jax.tree.map(lambda new, old: jnp.where(due, new, old), new, models)
         # The env was given actions cut at +-1, so that is what changed the state.
         data = batch._replace(action=jnp.clip(batch.action, -1, 1))

@@ -27,6 +27,7 @@ from pacesetter.policy import Actors, Floats
 from pacesetter.settings import STRICT, Width
 
 SMALLEST_VARIANCE = 1e-8  # as in the reference
+MODELS = 2**16  # what is folded into a key for the models: far from what the base splits off
 
 
 def has_rows(count: int, info: ValidationInfo) -> int:
@@ -113,7 +114,8 @@ class STEVE:
 
     def init(self, key: Array) -> State:
         learner = self.base.init(key)
-        models = self.dynamics.init(jax.random.fold_in(key, 1))
+        # Split off so that the base's own keys, and with them its weights, stay what they are.
+        models = self.dynamics.init(jax.random.fold_in(key, MODELS))
         moments = self.dynamics.init_optimizer(models)
         return State(models=models, models_optimizer=moments, **learner._asdict())
 
