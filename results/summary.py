@@ -20,10 +20,11 @@ from pacesetter.study.figures import pdf
 from pacesetter.study.results import compact
 
 HERE = Path(__file__).parent
-# What each study is compared at: env steps, or CPU time.
+# What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
-    "pilot": [{"budget": "30k"}, {"budget": "100k"}, {"budget": "200k"}],
-    "family": [{"budget": "30k"}, {"budget": "100k"}],
+    "pilot": [{"budget": "100k"}, {"budget": "200k"}],
+    "sunrise": [{"budget": "30k", "reference": "td3-30k"}],
+    "family": [{"budget": "100k", "reference": "sac"}],
     "choices": [{"budget": "30k"}],
     "trust-region": [{"budget": "1M"}],
     "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "5m"}],
@@ -51,7 +52,7 @@ def shown(study: str, limit: dict[str, str]) -> str:
     there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
     found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
     found += contrasts.best_of_two(there)
-    if (beside := paper.published(there)) is not None:
+    if study == "trust-region" and (beside := paper.published(there)) is not None:
         found.append(beside)
     name, value = next(iter(limit.items()))
     return tables.markdown(f"{study}: {name} {value}", there.notes, found)

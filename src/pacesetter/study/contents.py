@@ -104,13 +104,15 @@ def speed(comparison: Comparison) -> Table:
         row = [word(group.env), word(group.name), number(len(group.runs))]
         row += [soon(group.reached(level)) for level in LEVELS]
         cost = np.array([1_000 * run.cpu[-1] / run.steps[-1] for run in group.runs])
-        rows.append([*row, interval(stats.mean(cost), 2)])
+        rate = np.array([run.steps[-1] / run.wall[-1] for run in group.runs])
+        rows.append([*row, interval(stats.mean(cost), 2), interval(stats.mean(rate))])
     levels = [f"env steps to {level:,}" for level in LEVELS]
     notes = [
         "Env steps to a return: the first evaluation there, after the first update; median over "
-        "seeds and how many of them arrived, those that never do counting as last."
+        "seeds and how many of them arrived, those that never do counting as last. Steps/s: of the "
+        "whole run by the clock on the wall, with its warm-up and evaluations."
     ]
-    headers = ["env", "algorithm", "n", *levels, "CPU s per 1k steps"]
+    headers = ["env", "algorithm", "n", *levels, "CPU s per 1k steps", "env steps/s"]
     return Table("Better rewards sooner", headers, rows, notes, ledger(comparison.groups))
 
 
