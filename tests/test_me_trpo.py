@@ -284,9 +284,8 @@ def test_update_sees_all_steps_and_fresh_starts(
     np.testing.assert_allclose(starts[:, 0], 1.25, atol=0.01)  # the hopper's height at a reset
 
 
-@pytest.mark.parametrize(
-    "known", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["known", "learned"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False], ids=["known", "learned"])
 def test_stopped_run_equals_uninterrupted(known: bool, runs: Path) -> None:
     def start(name: str) -> Trainer:
         settings = {**RUN, "steps": 1_100, "replay_size": 600, "known": known, "name": name}

@@ -110,7 +110,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
 
 SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
 SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
-SLOW += ("steve", "steve-td3")
+SLOW += ("steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")
 
 
 @pytest.mark.parametrize(

@@ -164,6 +164,7 @@ def stop_after(tuning: Tuning, evaluations: int) -> None:
         tuning.run(quiet=True)
 
 
+@pytest.mark.slow
 def test_stopped_study_goes_on(undisturbed: list[Any]) -> None:
     """The open trial from its checkpoint: all trials are those of a study left alone."""
     stopped = study()
@@ -299,6 +300,7 @@ def worker(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, **pipes)
 
 
+@pytest.mark.slow
 def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     """All trials are made, each once; the survivor takes up what the other left."""
     words = ("--trials", "4", "--steps", "1500", "--warmup", "1M", "--study", "s.log")

@@ -127,14 +127,12 @@ def evaluate(words: list[str]) -> int:
         run = find(found.run, found.runs)
         path, env = run.policy_file, env or run.settings()["env"]
     policy = load(path)
-    env = env or policy.about.get("env")
-    if env == policy.about.get("env"):
+    task = env or policy.about.get("env")
+    if task == policy.about.get("env"):
         env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
-    acting = None if found.random else policy
-    result = evaluate(
-        acting, env, found.episodes, found.seed, noise=found.noise, env_kwargs=env_kwargs
-    )
-    about = {"env": env, "env_kwargs": env_kwargs, "seed": found.seed, "noise": found.noise}
+    how: Any = {"noise": found.noise, "env_kwargs": env_kwargs, "random": found.random}
+    result = evaluate(policy, env, found.episodes, found.seed, **how)
+    about = {"env": task, "env_kwargs": env_kwargs, "seed": found.seed, "noise": found.noise}
     source = None if found.random else str(path)
     if found.json:
         print(json.dumps({**result.table(), **about, "policy": source}))
@@ -143,7 +141,7 @@ def evaluate(words: list[str]) -> int:
             "uniform actions" if found.random else f"policy of step {policy.about.get('step', 0):,}"
         )
         print(
-            f"{env}: return {result.mean:.1f} +- {result.std:.1f} over {found.episodes} "
+            f"{task}: return {result.mean:.1f} +- {result.std:.1f} over {found.episodes} "
             f"episodes of {np.mean(result.lengths):.0f} steps; {who}"
         )
     return 0

@@ -63,8 +63,9 @@ def evaluate(
     *,
     noise: float = 0.0,
     env_kwargs: dict[str, Any] | None = None,
+    random: bool = False,
 ) -> Evaluation:
-    """Evaluate a policy on fresh episodes; without one, uniformly random actions.
+    """Evaluate a policy on fresh episodes; without one, or if asked to, uniformly random actions.
 
     The env defaults to the policy's own; `noise` is the deviation of Gaussian noise in [-1, 1].
     """
@@ -76,7 +77,8 @@ def evaluate(
         raise UsageError(f"noise: must be a finite number, at least 0, got {noise}")
     world = enter(policy, env, seed, env_kwargs)
     try:
-        return rollouts(_acting(policy, world, noise, seed), world, episodes)
+        acting = _acting(None if random else policy, world, noise, seed)
+        return rollouts(acting, world, episodes)
     finally:
         world.close()
 
