@@ -220,7 +220,7 @@ class Trainer:
         """Evaluate the champion on starts of its own and write the policy files."""
         run, progress = self.config.run, self.progress
         policy = self.policy()
-        trial = self._trial(progress.champion)
+        trial = self._trial(policy, progress.champion)
         score = {"score": trial.mean, "score_std": trial.std, "score_episodes": run.eval_episodes}
         policy.about.update(score)
         policy.save(self.directory.policy_file)
@@ -230,16 +230,16 @@ class Trainer:
             policy.save(self.directory.best_file)
         values = trial.table() | {"champion": progress.champion}
         if ending and run.rule == "none" and run.members > 1:
-            values["members"] = [self._trial(k).mean for k in range(run.members)]
+            values["members"] = [self._trial(self.policy(k), k).mean for k in range(run.members)]
         self._emit("eval", values)
 
-    def _trial(self, member: int) -> Evaluation:
+    def _trial(self, policy: Policy, member: int) -> Evaluation:
         run, progress = self.config.run, self.progress
         if self._evaluation_env is None:
             env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
             self._evaluation_env = env
         with blame(member, progress.step):
-            return rollouts(self.policy(member).act, self._evaluation_env, run.eval_episodes)
+            return rollouts(policy.act, self._evaluation_env, run.eval_episodes)
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
