@@ -101,7 +101,7 @@ def relative_error(dynamics: Dynamics, models: Models, rows: Batch) -> tuple[Flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--rows", type=int, default=30_000, help="rows to learn from")
+    parser.add_argument("--rows", type=int, default=50_000, help="rows to learn from")
     parser.add_argument("--policy", nargs="*", type=Path, default=None, help="policy files")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
@@ -128,12 +128,12 @@ def main() -> None:
     table: list[list[Any]] = []
     for name, models in made.items():
         own, together = relative_error(dynamics, models, held)
-        passed = "yes" if own.mean() <= TARGET else "no"
+        passed = "yes" if own.max() <= TARGET else "no"
         table.append([name, own.mean(), own.max(), together.mean(), passed])
     print(
         f"{chosen.env}: {chosen.rows} rows, {len(held.reward)} held out, {len(policies)} policies"
     )
-    heads = ["model", "error", "worst number", "of the members' mean", f"error at most {TARGET}"]
+    heads = ["model", "error", "worst number", "of the members' mean", f"all at most {TARGET}"]
     print(tabulate(table, headers=heads, floatfmt=".4f"))
     if any(row[-1] == "no" for row in table):
         sys.exit(1)

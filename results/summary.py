@@ -27,7 +27,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "family": [{"budget": "100k", "reference": "sac"}],
     "choices": [{"budget": "30k"}],
     "trust-region": [{"budget": "1M"}],
-    "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "5m"}],
+    "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "410s"}],
     "imagined": [{"budget": "45k"}],
     "walkers": [{"budget": "30k"}],
 }

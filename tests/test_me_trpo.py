@@ -12,7 +12,7 @@ from scipy.stats import chisquare
 
 import test_kill
 from conftest import assert_same, log, run_to_end
-from pacesetter import config
+from pacesetter import config, trust_region
 from pacesetter.algorithm import Batch, Spec
 from pacesetter.algorithms import me_trpo, trpo
 from pacesetter.cli import main
@@ -64,13 +64,13 @@ def linear(algorithm: me_trpo.METRPO, *drifts: float) -> Models:
     return models._replace(networks=models.networks._replace(change=change), scale=scale)
 
 
-def steady(action: float) -> trpo.Gaussian:
+def steady(action: float) -> trust_region.Gaussian:
     """A policy whose mean is the same everywhere."""
     network = (
         {"kernel": jnp.zeros((1, 8)), "bias": jnp.zeros(8)},
         {"kernel": jnp.zeros((8, 1)), "bias": jnp.full(1, action)},
     )
-    return trpo.Gaussian(network, jnp.full(1, jnp.log(0.5)))
+    return trust_region.Gaussian(network, jnp.full(1, jnp.log(0.5)))
 
 
 # Imagined steps.

@@ -9,8 +9,10 @@ from scipy import stats
 
 from conftest import TINY, content, run_to_end
 from pacesetter.settings import OffPolicy
-from pacesetter.training import priorities
-from pacesetter.training.priorities import ByError, ByReturn, Sums, Uniform, choose
+from pacesetter.training.by_error import MEASURES, ByError, Sums
+from pacesetter.training.by_return import ByReturn
+from pacesetter.training.drawing import Uniform
+from pacesetter.training.priorities import choose
 from pacesetter.training.replay import Columns, Replay
 from pacesetter.training.trainer import Trainer
 
@@ -21,7 +23,7 @@ KINDS = ("prioritized", "lap", "return")
 def per(
     size: int, exponent: float = 0.6, importance: float = 0.4, kind: str = "prioritized"
 ) -> Any:
-    return ByError(size, exponent, importance, priorities.MEASURES[kind])
+    return ByError(size, exponent, importance, MEASURES[kind])
 
 
 def grow(drawing: Any, count: int, member: int = 0) -> range:

@@ -13,7 +13,7 @@ from scipy.stats import norm
 import test_kill
 from broken_envs import Late
 from conftest import assert_same, log, run_to_end
-from pacesetter import storage
+from pacesetter import storage, trust_region
 from pacesetter.algorithm import Batch, Spec, Update
 from pacesetter.algorithms import trpo
 from pacesetter.cli import main
@@ -71,7 +71,7 @@ def updated() -> list[tuple[trpo.State, Batch, Update]]:
 def test_log_probability_equals_scipy(rng: np.random.Generator) -> None:
     mean, action, log_std = rng.normal(size=(5, 2)), rng.normal(size=(5, 2)), rng.normal(size=2)
     expected = norm.logpdf(action, mean, np.exp(log_std)).sum(axis=1)
-    found = trpo.log_probability((jnp.array(mean), jnp.array(log_std)), jnp.array(action))
+    found = trust_region.log_probability((jnp.array(mean), jnp.array(log_std)), jnp.array(action))
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
@@ -82,7 +82,7 @@ def test_kl_of_known_pairs(mean: float, std: float, expected: float) -> None:
     """From the standard Gaussian, in the paper's direction KL(old || new)."""
     old = (jnp.zeros((4, 1)), jnp.zeros(1))
     new = (jnp.full((4, 1), mean), jnp.log(jnp.full(1, std)))
-    np.testing.assert_allclose(trpo.kl(old, new), expected, atol=1e-6)
+    np.testing.assert_allclose(trust_region.kl(old, new), expected, atol=1e-6)
 
 
 # The step.
@@ -94,14 +94,14 @@ def test_fisher_product_equals_hessian_of_kl(rng: np.random.Generator) -> None:
     parameters += 0.3 * rng.normal(size=len(parameters)).astype(np.float32)
     observation = jnp.array(rng.normal(size=(50, 3)), jnp.float32)
 
-    def distribution(parameters: Any) -> trpo.Moments:
-        return trpo.moments(unravel(parameters), observation)
+    def distribution(parameters: Any) -> trust_region.Moments:
+        return trust_region.moments(unravel(parameters), observation)
 
     @jax.jit
     def both(parameters: Any) -> Any:
         old = distribution(parameters)
-        product = trpo.fisher_product(distribution, parameters)
-        hessian = jax.hessian(lambda p: trpo.kl(old, distribution(p)))(parameters)
+        product = trust_region.fisher_product(distribution, parameters)
+        hessian = jax.hessian(lambda p: trust_region.kl(old, distribution(p)))(parameters)
         return jax.vmap(product)(jnp.eye(len(parameters))), hessian
 
     found, hessian = both(parameters)
@@ -135,15 +135,17 @@ def test_step_is_along_the_natural_gradient(rng: np.random.Generator) -> None:
         parameters, unravel = ravel_pytree(actor)
         assert len(parameters) == 22
 
-        def distribution(parameters: Any) -> trpo.Moments:
-            return trpo.moments(unravel(parameters), observation)
+        def distribution(parameters: Any) -> trust_region.Moments:
+            return trust_region.moments(unravel(parameters), observation)
 
         def surrogate(parameters: Any) -> Any:  # its gradient where the ratio is 1
-            return (trpo.log_probability(distribution(parameters), action) * advantage).mean()
+            return (
+                trust_region.log_probability(distribution(parameters), action) * advantage
+            ).mean()
 
         @jax.jit
         def slopes(parameters: Any) -> Any:
-            product = trpo.fisher_product(distribution, parameters)
+            product = trust_region.fisher_product(distribution, parameters)
             return jax.grad(surrogate)(parameters), jax.vmap(product)(jnp.eye(22))
 
         gradient, fisher = jax.device_get(slopes(parameters))
@@ -173,17 +175,17 @@ def test_updates_stay_in_the_trust_region(updated: Any) -> None:
     """KL and gain, computed anew from the actors before and after, are as reported and allowed."""
     for state, batch, update in updated:
         old, new = (
-            trpo.moments(actor, batch.observation.reshape(-1, 3))
+            trust_region.moments(actor, batch.observation.reshape(-1, 3))
             for actor in (state.actor, update.state.actor)
         )
-        divergence = float(trpo.kl(old, new))
+        divergence = float(trust_region.kl(old, new))
         np.testing.assert_allclose(divergence, update.losses["kl"], rtol=1e-3, atol=1e-7)
         assert update.losses["accepted"] == 1
         assert 0 < divergence <= 0.02 + 1e-6
         assert update.losses["surrogate"] > 0
     first, last = updated[0][0].actor, updated[-1][2].state.actor
     observation = jnp.zeros((1, 3))
-    rise = trpo.moments(last, observation)[0] - trpo.moments(first, observation)[0]
+    rise = trust_region.moments(last, observation)[0] - trust_region.moments(first, observation)[0]
     assert (rise > 0.3).all()  # larger actions pay more
 
 
@@ -207,7 +209,7 @@ def test_line_search_takes_the_first_that_passes_or_none(limit: float, expected:
         return candidate[0] <= tried, jnp.stack([candidate[0]])
 
     start = jnp.zeros(1)
-    found, accepted, measures = trpo.line_search(judge, start, jnp.ones(1), 0.8, 5)
+    found, accepted, measures = trust_region.line_search(judge, start, jnp.ones(1), 0.8, 5)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert bool(accepted) == (expected > 0)
     np.testing.assert_allclose(measures, expected, rtol=1e-6)
@@ -217,7 +219,7 @@ def test_line_search_takes_no_nan() -> None:
     def judge(candidate: Any) -> Any:
         return jnp.sqrt(-candidate[0]) >= 0, jnp.stack([jnp.nan])
 
-    found, accepted, measures = trpo.line_search(judge, jnp.zeros(1), jnp.ones(1), 0.8, 3)
+    found, accepted, measures = trust_region.line_search(judge, jnp.zeros(1), jnp.ones(1), 0.8, 3)
     assert (found, accepted, measures) == (0, False, 0)
 
 
@@ -438,7 +440,7 @@ def test_statistics_stay_during_an_iteration(runs: Path, monkeypatch: pytest.Mon
             np.testing.assert_allclose(deviation, together.std(axis=0), rtol=1e-3, atol=1e-3)
         batch = trainer.ensemble.columns.unpack(jnp.array(rows), None)
         scaled = jnp.clip((batch.observation - mean) / deviation, -10, 10)
-        middle, log_std = trpo.moments(trpo.Gaussian(*acting), scaled)
+        middle, log_std = trust_region.moments(trust_region.Gaussian(*acting), scaled)
         noise = (batch.action - middle) / np.exp(log_std)
         drawn = np.stack([rng.standard_normal((20, 3), np.float32) for rng in streams], axis=1)
         np.testing.assert_allclose(noise, drawn, atol=1e-4)

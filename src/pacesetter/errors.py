@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any
 
 LONGEST = 500
 
@@ -31,3 +32,17 @@ def unknown(kind: str, word: str, options: Iterable[str]) -> UsageError:
     else:
         hint = f"{len(options)} are known; see `pacesetter list`"
     return UsageError(f"{kind}: unknown '{word}'; {hint}")
+
+
+class blame:  # noqa: N801 (a context manager reads as a verb)
+    """Name member (or env) and step in whatever an env does wrong."""
+
+    def __init__(self, number: int, step: int, who: str = "member") -> None:
+        self.where = f"{who} {number}, step {step}"
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, TrainingError):
+            raise TrainingError(f"{self.where}: {error}") from error

@@ -24,6 +24,7 @@ from pacesetter.dynamics import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
 from pacesetter.fitting import fit
 from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
 from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
+from pacesetter.trust_region import Gaussian, moments
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -70,7 +71,7 @@ class Search(NamedTuple):
     """Where the policy's search in the models is."""
 
     learner: trpo.State
-    kept: trpo.Gaussian
+    kept: Gaussian
     returns: Array  # (K,) of the policy kept last
     stale: Array  # updates since then
     made: Array  # updates in all
@@ -94,7 +95,7 @@ class METRPO:
         none = jnp.zeros((), jnp.int32)
         return State(self.base.init(learner_key), models, none, none, none)
 
-    def acting(self, state: State) -> trpo.Gaussian:
+    def acting(self, state: State) -> Gaussian:
         return state.learner.actor
 
     def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
@@ -192,7 +193,7 @@ class METRPO:
         begin = Search(learner, learner.actor, returns, none, none)
         return jax.lax.while_loop(go_on, improve, begin)
 
-    def imagine(self, models: Models, actor: trpo.Gaussian, starts: Array, key: Array) -> Batch:
+    def imagine(self, models: Models, actor: Gaussian, starts: Array, key: Array) -> Batch:
         """Imagined episodes as a rollout (horizon, E, ...), one model drawn for each step.
 
         Where an episode ends before the horizon, another begins; it is cut with the rest.
@@ -204,7 +205,7 @@ class METRPO:
 
         def step(observation: Array, key: Array) -> tuple[Array, Batch]:
             act_key, choice_key, model_key, start_key = jax.random.split(key, 4)
-            mean, log_std = trpo.moments(actor, observation)
+            mean, log_std = moments(actor, observation)
             action = mean + jnp.exp(log_std) * jax.random.normal(act_key, mean.shape)
             one = dynamics.choose(models, jax.random.randint(choice_key, (), 0, dynamics.members))
             parts = self.transition(one, observation[None], action[None], model_key)
@@ -228,12 +229,12 @@ class METRPO:
             return batch
         return batch._replace(discount=batch.discount.at[-1].set(0))
 
-    def returns(self, models: Models, actor: trpo.Gaussian, starts: Array) -> Array:
+    def returns(self, models: Models, actor: Gaussian, starts: Array) -> Array:
         """Mean return (K,) of the mean action in each model alone, from all starts (M, O)."""
 
         def step(carry: tuple[Array, Array], key: Array) -> tuple[Any, Array]:
             observation, running = carry
-            action, _ = trpo.moments(actor, observation)
+            action, _ = moments(actor, observation)
             following, reward, terminated = self.transition(models, observation, action, key)
             return (following, running & ~terminated), running * reward
 

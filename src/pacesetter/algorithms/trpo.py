@@ -24,6 +24,15 @@ from pacesetter import nets
 from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.policy import Actors, Floats, forward
 from pacesetter.settings import STRICT, OnPolicy, Width
+from pacesetter.trust_region import (
+    Gaussian,
+    Moments,
+    fisher_product,
+    kl,
+    line_search,
+    log_probability,
+    moments,
+)
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -41,13 +50,6 @@ class Hyper(OnPolicy):
     critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critic")
     critic_epochs: int = Field(20, ge=0, description="passes of the critic over a rollout")
     critic_batch_size: int = Field(128, ge=1, description="observations in its minibatches")
-
-
-class Gaussian(NamedTuple):
-    """A policy: a tanh network of the mean (A,), and a log deviation (A,) that sees nothing."""
-
-    network: nets.Network
-    log_std: Array
 
 
 class State(NamedTuple):
@@ -226,80 +228,6 @@ def advantages(batch: Batch, values: Array, next_values: Array, decay: float) ->
 
     share = decay * batch.discount * (1 - batch.last)
     return jax.lax.scan(step, jnp.zeros_like(delta[0]), (delta, share), reverse=True)[1]
-
-
-# A diagonal Gaussian: its mean (B, A) and log deviation (A,).
-Moments = tuple[Array, Array]
-
-
-def moments(actor: Gaussian, observation: Array) -> Moments:
-    return nets.apply(actor.network, observation, jnp.tanh), actor.log_std
-
-
-def log_probability(moments: Moments, action: Array) -> Array:
-    """log pi (B,) of actions (B, A), which are not cut."""
-    mean, log_std = moments
-    distance = (action - mean) * jnp.exp(-log_std)
-    return -(0.5 * distance**2 + log_std + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=-1)
-
-
-def kl(old: Moments, new: Moments) -> Array:
-    """Mean over B of KL(old || new)."""
-    (old_mean, old_log_std), (mean, log_std) = old, new
-    squares = jnp.exp(2 * old_log_std) + (old_mean - mean) ** 2
-    each = log_std - old_log_std + 0.5 * squares * jnp.exp(-2 * log_std) - 0.5
-    return each.sum(axis=-1).mean()
-
-
-def fisher_product(
-    distribution: Callable[[Array], Moments], parameters: Array
-) -> Callable[[Array], Array]:
-    """v -> Fv, where F is the Hessian of the mean KL from `parameters` to themselves.
-
-    F = J'MJ exactly, with J the Jacobian of mean and log deviation, and M the Fisher matrix of a
-    Gaussian in those, which is diagonal: 1 / std^2 and 2.
-    """
-    (mean, log_std), jacobian = jax.linearize(distribution, parameters)
-    transposed = jax.linear_transpose(jacobian, parameters)
-
-    def product(vector: Array) -> Array:
-        mean_change, log_std_change = jacobian(vector)
-        weighted = mean_change * jnp.exp(-2 * log_std) / len(mean)
-        return transposed((weighted, 2 * log_std_change))[0]
-
-    return product
-
-
-def line_search(
-    judge: Callable[[Array], tuple[Array, Array]],
-    start: Array,
-    step: Array,
-    ratio: float,
-    tries: int,
-) -> tuple[Array, Array, Array]:
-    """The first of start + ratio^j * step that `judge` takes, whether any was, and its measures.
-
-    If none of j < tries is taken: start, False and zeros.
-    """
-
-    def goes_on(carry: Any) -> Array:
-        j, _, accepted, _ = carry
-        return ~accepted & (j < tries)
-
-    def attempt(carry: Any) -> Any:
-        j, *_ = carry
-        candidate = start + ratio**j * step
-        return j + 1, candidate, *judge(candidate)
-
-    _, measures = jax.eval_shape(judge, start)
-    nothing = jnp.zeros(measures.shape, measures.dtype)
-    begin = (jnp.zeros((), jnp.int32), start, jnp.array(False), nothing)
-    _, candidate, accepted, measures = jax.lax.while_loop(goes_on, attempt, begin)
-    return (
-        jnp.where(accepted, candidate, start),
-        accepted,
-        jnp.where(accepted, measures, nothing),
-    )
 
 
 def standardize(x: Array) -> Array:

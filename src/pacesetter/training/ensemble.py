@@ -7,7 +7,6 @@ when the round is over, all start again from the rule's choice  turn
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +17,16 @@ from pacesetter import algorithms
 from pacesetter.algorithm import Algorithm, Spec
 from pacesetter.config import Config
 from pacesetter.envs import Environment
-from pacesetter.errors import TrainingError
-from pacesetter.evaluation import rollouts
+from pacesetter.errors import TrainingError, blame
 from pacesetter.policy import Floats, Policy, clip, normalize
 from pacesetter.process import threads
 from pacesetter.rules import Parents
 from pacesetter.seeding import Stream, generator
-from pacesetter.training import priorities
 from pacesetter.training import selection as selections
 from pacesetter.training.n_step import Pending, Transition
 from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Cycle, Population, inherit
+from pacesetter.training.priorities import choose
 from pacesetter.training.progress import Member, Progress
 from pacesetter.training.replay import Columns, Replay, Sample
 from pacesetter.training.selection import Selection
@@ -76,7 +74,7 @@ class Ensemble:
         size = self.config.hyper.replay_size
         for i in range(count):
             path = folder / f"replay-{i}.bin"
-            drawing = priorities.choose(self.config.hyper, min(size, self.budget))
+            drawing = choose(self.config.hyper, min(size, self.budget))
             self.replays.append(Replay(path, self.columns, size, self.budget, drawing))
 
     @property
@@ -92,22 +90,6 @@ class Ensemble:
         selection = self.turn()
         self.progress.tick += 1
         return selection
-
-    def trial(self, k: int) -> list[float]:
-        """Returns of noise-free episodes of a member, from the starts of this selection."""
-        run, progress = self.config.run, self.progress
-        if self.trial_env is None:
-            self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
-        first, left = progress.selections * run.select_window, self.budget - progress.step
-        counted = run.count_selection_steps
-        with blame(k, progress.step):
-            act = self.current(k).act
-            trial = rollouts(
-                act, self.trial_env, run.select_window, first, limit=left if counted else inf
-            )
-        progress.selection_steps += sum(trial.lengths)
-        progress.free_steps += 0 if counted else sum(trial.lengths)
-        return trial.returns
 
     def close(self) -> None:
         """Let go of envs, files and threads."""
@@ -332,17 +314,3 @@ class Ensemble:
         assessments = [self.progress.members[parent].assessment.copy() for parent in parents]
         for member, assessment in zip(self.progress.members, assessments, strict=True):
             member.assessment = replace(assessment, over=member.assessment.over)
-
-
-class blame:  # noqa: N801 (a context manager reads as a verb)
-    """Name member (or env) and step in whatever an env does wrong."""
-
-    def __init__(self, number: int, step: int, who: str = "member") -> None:
-        self.where = f"{who} {number}, step {step}"
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, TrainingError):
-            raise TrainingError(f"{self.where}: {error}") from error

@@ -17,11 +17,10 @@ from pacesetter import algorithms, known
 from pacesetter.algorithm import Algorithm, Spec
 from pacesetter.config import Config
 from pacesetter.envs import Environment
-from pacesetter.errors import TrainingError
+from pacesetter.errors import TrainingError, blame
 from pacesetter.policy import Floats, Policy, clip, normalize
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings import ModelDriven
-from pacesetter.training.ensemble import blame
 from pacesetter.training.n_step import Pending
 from pacesetter.training.normalizer import Normalizer, Statistics
 from pacesetter.training.population import Population

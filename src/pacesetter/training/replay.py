@@ -16,7 +16,7 @@ from pacesetter.algorithm import Array, Batch
 from pacesetter.errors import UsageError
 from pacesetter.policy import Floats
 from pacesetter.storage import Arrays, digest
-from pacesetter.training.priorities import Drawing, Numbers, Uniform
+from pacesetter.training.drawing import Drawing, Numbers, Uniform
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pacesetter.envs import Environment
+from pacesetter.errors import blame
+from pacesetter.evaluation import rollouts
 from pacesetter.rules import RULES, Parents
+from pacesetter.seeding import Stream
 
 if TYPE_CHECKING:
     from pacesetter.training.ensemble import Ensemble
@@ -66,12 +71,27 @@ def on_trials(ensemble: Ensemble) -> Selection | None:
     if progress.step < progress.next_selection or progress.step >= ensemble.budget:
         return None
     every = config.run.select_every * config.unit
-    returns = [ensemble.trial(k) for k in range(config.run.members)]
+    returns = [_trial(ensemble, k) for k in range(config.run.members)]
     progress.next_selection = (progress.step // every + 1) * every
     # A selection that the budget cut short decides nothing.
     if progress.step >= ensemble.budget:
         return None
     return _select(ensemble, np.array(returns), paired=True)
+
+
+def _trial(ensemble: Ensemble, k: int) -> list[float]:
+    """Returns of noise-free episodes of a member, from the starts of this selection."""
+    run, progress = ensemble.config.run, ensemble.progress
+    if ensemble.trial_env is None:
+        ensemble.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
+    env, first = ensemble.trial_env, progress.selections * run.select_window
+    counted = run.count_selection_steps
+    limit = ensemble.budget - progress.step if counted else inf
+    with blame(k, progress.step):
+        trial = rollouts(ensemble.current(k).act, env, run.select_window, first, limit=limit)
+    progress.selection_steps += sum(trial.lengths)
+    progress.free_steps += 0 if counted else sum(trial.lengths)
+    return trial.returns
 
 
 def _select(ensemble: Ensemble, returns: Returns, paired: bool) -> Selection:

@@ -10,14 +10,14 @@ import jax
 
 from pacesetter.config import read_file, settle
 from pacesetter.envs import Environment
-from pacesetter.errors import TrainingError, UsageError
+from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
-from pacesetter.training.ensemble import Ensemble, blame
+from pacesetter.training.ensemble import Ensemble
 from pacesetter.training.iterations import Iterations
 from pacesetter.training.progress import TRAIN_ROW_EVERY, Clock, Progress
 
