@@ -22,7 +22,11 @@ from pacesetter.study.results import compact
 HERE = Path(__file__).parent
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
-    "pilot": [{"budget": "100k"}, {"budget": "200k"}],
+    "pilot": [
+        {"budget": "100k"},
+        {"budget": "100k", "reference": "multi-td3"},
+        {"budget": "200k"},
+    ],
     "sunrise": [{"budget": "30k", "reference": "td3-30k"}],
     "family": [{"budget": "100k", "reference": "sac"}],
     "choices": [{"budget": "30k"}],
