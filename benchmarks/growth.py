@@ -27,13 +27,15 @@ from pacesetter.training.replay import Columns, Replay
 matplotlib.use("Agg")
 SQUARE = ((256, 256), (256, 256), (((1,), (0,)), ((), ())))
 CHEETAH = Spec(17, 6)
+LEAST = 30.0  # top over bottom of a plot
 
 
 class Point(NamedTuple):
-    """One measured size: seconds by update (or draw, or step) and its floor in seconds."""
+    """One measured size: seconds of `each` (update, draw, step) and their floor, if it has one."""
 
     what: str
     size: int
+    each: str
     seconds: float
     floor: float | None
 
@@ -60,7 +62,7 @@ def updates(what: str, sizes: list[int], task: Callable[[int], Any]) -> Iterator
             took[size].append(timed(call, repeats) / cycle)
             floors[size].append(work / best())
     for size in sizes:
-        yield Point(what, size, median(took[size]), median(floors[size]))
+        yield Point(what, size, "update", median(took[size]), median(floors[size]))
 
 
 def members(size: int) -> Any:
@@ -89,7 +91,7 @@ def replay(sizes: list[int]) -> Iterator[Point]:
             ring.head = size
             took = median(timed(lambda r=ring: r.sample(rng, (256,)), 200) for _ in range(5))
             ring.close()
-        yield Point("replay rows (a draw)", size, took, None)
+        yield Point("replay rows", size, "draw of 256", took, None)
 
 
 def updates_per_step(sizes: list[int]) -> Iterator[Point]:
@@ -104,7 +106,7 @@ def updates_per_step(sizes: list[int]) -> Iterator[Point]:
                 trainer.ensemble.tick()
             took = median(timed(trainer.ensemble.tick, 100) for _ in range(3))
             trainer.close()
-        yield Point("updates a step (a step)", size, took, None)
+        yield Point("updates a step", size, "step", took, None)
 
 
 def measured() -> Iterator[Point]:
@@ -130,9 +132,13 @@ def picture(points: list[Point], path: str) -> None:
         if own[0].floor is not None:
             floors = [(p.floor or 0) * 1e3 for p in own]
             axes.loglog(sizes, floors, "--", color="#D55E00", label="floor from FLOPs")
-        axes.set(xlabel=kind, ylabel="milliseconds", xticks=sizes)
+        axes.set(xlabel=kind, ylabel=f"ms a {own[0].each}".replace("a u", "an u"))
         axes.set_xticks(sizes, [f"{size:,}" for size in sizes], minor=False)
         axes.set_xticks([], minor=True)
+        bottom, top = axes.get_ylim()
+        wider = max(1.0, LEAST * (bottom / top)) ** 0.5  # what hardly grows should look flat
+        axes.set_ylim(bottom / wider, top * wider)
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.grid(alpha=0.3)
     grid.flat[0].legend(frameon=False)
     figure.savefig(path, dpi=110)
@@ -140,7 +146,7 @@ def picture(points: list[Point], path: str) -> None:
 
 def row(point: Point) -> tuple[str, ...]:
     """A line of the table."""
-    start = (point.what, f"{point.size:,}", f"{point.seconds * 1e3:.3f}")
+    start = (point.what, f"{point.size:,}", point.each, f"{point.seconds * 1e3:.3f}")
     if point.floor is None:
         return (*start, "-", "-")
     return (*start, f"{point.floor * 1e3:.3f}", f"{point.floor / point.seconds:.2f}")
@@ -152,18 +158,9 @@ def main() -> None:
     parser.add_argument("-o", "--output", default="growth.png")
     chosen = parser.parse_args()
     points = list(measured())
-    rows = [
-        (p.what, f"{p.size:,}", f"{p.seconds * 1e3:.3f}")
-        + (
-            ("-", "-")
-            if p.floor is None
-            else (f"{p.floor * 1e3:.3f}", f"{p.floor / p.seconds:.2f}")
-        )
-        for p in points
-    ]
     print(f"jax {jax.__version__}, {len(os.sched_getaffinity(0))} cores\n")
-    heads = ["setting", "size", "ms an update", "floor ms", "floor / measured"]
-    print(tabulate(rows, heads, "github", disable_numparse=True))
+    heads = ["setting", "size", "of each", "ms", "floor, ms", "floor / measured"]
+    print(tabulate([row(point) for point in points], heads, "github", disable_numparse=True))
     picture(points, chosen.output)
 
 

@@ -14,6 +14,7 @@ from pacesetter.config import settle
 from pacesetter.training.population import Population
 from pacesetter.training.replay import Columns
 from pacesetter.training.trainer import Trainer
+from pacesetter.training.trainer import _prepare_jax as prepare_jax
 
 HALF_CHEETAH = Spec(17, 6)
 WORK = {
@@ -43,6 +44,24 @@ def test_an_update_computes_little_but_its_matrix_products(name: str, megabytes:
     found = costs(name)
     assert WORK[name] <= found["flops"] <= 1.03 * WORK[name]
     assert found["bytes accessed"] <= megabytes * 1e6
+
+
+def test_programs_are_kept_apart_by_the_cores_they_were_compiled_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One from a pinned run, which splits no loop, would slow down a run on two cores by 8%."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    before = jax.config.jax_compilation_cache_dir
+    kept: set[Path] = set()
+    for threads, cores in (("1", {0}), ("2", {0}), ("2", {0, 1})):
+        monkeypatch.setenv("NPROC", threads)
+        monkeypatch.setattr("os.sched_getaffinity", lambda process, cores=cores: cores)
+        prepare_jax("cpu")
+        kept.add(Path(jax.config.jax_compilation_cache_dir or ""))
+    jax.config.update("jax_compilation_cache_dir", before)
+    assert len(kept) == 3
+    assert all(folder.is_relative_to(tmp_path) for folder in kept)
 
 
 def test_nothing_is_compiled_after_the_first_round(tmp_path: Path) -> None:

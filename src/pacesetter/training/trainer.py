@@ -13,6 +13,7 @@ from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.policy import Policy
+from pacesetter.process import threads
 from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
@@ -257,7 +258,9 @@ def _prepare_jax(device: str) -> None:
     """Choose the device and keep compiled programs, of which JAX stores none by default."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and "HOME" in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter"))
+        # XLA splits loops for the cores it compiles on, which JAX's own key for a program ignores.
+        cores = f"{threads()}-threads-{len(os.sched_getaffinity(0))}-cores"
+        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter" / cores))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     if device != "auto":
