@@ -122,6 +122,7 @@ def measured() -> Iterator[Point]:
 def picture(points: list[Point], path: str) -> None:
     """One small plot a setting: measured, and the floor where there is one."""
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import LogLocator
 
     kinds = list(dict.fromkeys(point.what for point in points))
     figure, grid = plt.subplots(2, 3, figsize=(11, 6), layout="constrained")
@@ -138,7 +139,9 @@ def picture(points: list[Point], path: str) -> None:
         bottom, top = axes.get_ylim()
         wider = max(1.0, LEAST * (bottom / top)) ** 0.5  # what hardly grows should look flat
         axes.set_ylim(bottom / wider, top * wider)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
         axes.grid(alpha=0.3)
     grid.flat[0].legend(frameon=False)
     figure.savefig(path, dpi=110)
