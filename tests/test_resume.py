@@ -86,6 +86,7 @@ CASES = {
     "steve": {"env": "Hopper-v5", "algorithm": "multi-steve", "copy": "weights", **MODELS},
     "steve-td3": {"env": "Hopper-v5", "algorithm": "multi-steve-td3", **MODELS},
     "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
+    "bf16": {"env": "Hopper-v5", "precision": "bf16", "hidden": (64, 64), "batch_size": 64},
 }
 
 
@@ -110,7 +111,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
 
 SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
 SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
-SLOW += ("steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")
+SLOW += ("bf16", "steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")
 
 
 @pytest.mark.parametrize(

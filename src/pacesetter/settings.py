@@ -153,6 +153,9 @@ class OffPolicy(Hyper):
     update_every: Count | None = Field(
         None, ge=1, description="own steps between blocks of updates; none is 1"
     )
+    precision: Literal["f32", "bf16"] = Field(
+        "f32", description="of what large matrix products multiply; sums are float32 in both"
+    )
 
     @property
     def block(self) -> int:

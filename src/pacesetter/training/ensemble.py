@@ -44,7 +44,9 @@ class Ensemble:
         spec = Spec(first.observation_size, first.action_size)
         self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
         self.columns = columns = Columns(*spec, len(self.algorithm.mask(generator(0, Stream.MASK))))
-        self.population = Population(self.algorithm, columns, run.seed, hyper.normalize_observation)
+        self.population = Population(
+            self.algorithm, columns, run.seed, hyper.normalize_observation, hyper.precision
+        )
         self.states = self.population.init(run.members, run.same_init)
         self.acting = self.population.acting(self.states)
         self.loss_names = self.population.loss_names(self.states[0])

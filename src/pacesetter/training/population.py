@@ -19,6 +19,7 @@ from pacesetter.envs import Environment
 from pacesetter.policy import OBSERVATION_LIMIT, Floats, Policy, unstack
 from pacesetter.rules import Parents
 from pacesetter.training.normalizer import Statistics
+from pacesetter.training.precision import bfloat16_products
 from pacesetter.training.replay import Columns
 
 
@@ -41,12 +42,20 @@ class Cycle(NamedTuple):
 class Population:
     """The compiled functions of one algorithm: the same program for every member and seed."""
 
-    def __init__(self, algorithm: Algorithm, columns: Columns, seed: int, normalize: bool) -> None:
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        columns: Columns,
+        seed: int,
+        normalize: bool,
+        precision: str = "f32",
+    ) -> None:
         self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
         self._acting = jax.jit(algorithm.acting)
-        self._update = jax.jit(self._update_one, donate_argnums=0)
+        update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
+        self._update = jax.jit(update, donate_argnums=0)
 
     def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""
