@@ -94,7 +94,8 @@ def whole(
     config = settle(name, "HalfCheetah-v5", settings)
     algorithm = algorithms.find(config.run.algorithm).build(spec, config.hyper)
     columns = Columns(*spec, len(algorithm.mask(np.random.default_rng(0))))
-    population = Population(algorithm, columns, 0, config.hyper.normalize_observation)
+    hyper = config.hyper
+    population = Population(algorithm, columns, 0, hyper.normalize_observation, hyper.precision)
     states = population.init(members, same=False)
     size = (algorithm.cycle, config.hyper.batch_size, columns.width)
     rows = np.random.default_rng(0).normal(size=size).astype(np.float32)

@@ -1,6 +1,6 @@
 """What a run spends beside its updates: outside time, members, checkpoints, memory, start-up.
 
-    python benchmarks/costs.py outside members checkpoint startup
+    python benchmarks/costs.py outside members precision checkpoint startup
     python benchmarks/costs.py memory        15 minutes: a full replay of 1M rows, then 200k updates
 
 Each line names its target. Nothing else should run on the machine meanwhile.
@@ -10,9 +10,7 @@ import argparse
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -35,45 +33,63 @@ trainer.ensemble.tick()
 
 
 def outside(folder: str) -> None:
-    """Share of a run's time that is not spent in updates, drawing of batches counted as outside."""
+    """Share of a run's time that is spent outside the compiled update, checkpoints included."""
     trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1000, **QUIET)
-    ensemble, spent, marks = trainer.ensemble, [0.0], []
+    population, spent, marks = trainer.ensemble.population, [0.0], []
+    update = population.update
 
-    def watched(work: Callable[..., Any], sign: int) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
-            began = perf_counter()
-            try:
-                return work(*arguments)
-            finally:
-                spent[0] += sign * (perf_counter() - began)
+    def watched(*arguments: Any) -> Any:
+        began = perf_counter()
+        try:
+            return update(*arguments)
+        finally:
+            spent[0] += perf_counter() - began
 
-        return call
-
-    ensemble.learn = watched(ensemble.learn, 1)
-    ensemble.replays[0].sample = watched(ensemble.replays[0].sample, -1)
+    population.update = watched
     for report in trainer:
         if report.kind == "train" and report.step >= 2000:
             marks.append((perf_counter(), spent[0]))
-        if report.step >= 7000:
+        if marks and marks[-1][0] - marks[0][0] > 2.2 * trainer.config.run.checkpoint_every:
             break
-    shares = [1 - (b - a) / (now - then) for (then, a), (now, b) in pairwise(marks)]
-    print(f"outside the update: {median(shares):.3f} of a run (target 0.08 at most)")
+    (then, a), (now, b) = marks[0], marks[-1]
+    print(f"outside the update: {1 - (b - a) / (now - then):.3f} of a run (target 0.08 at most)")
 
 
 def members(folder: str) -> None:
     """Member updates/s of K members over those of one, alternating."""
-    cycles = {k: whole("td3", SPECS[ENV], k) for k in (1, 2, 5, 10)}
-    rates: dict[int, list[float]] = {k: [] for k in cycles}
+    rates = alternating({k: whole("td3", SPECS[ENV], k) for k in (1, 2, 5, 10)})
+    for k, found in rates.items():
+        print(
+            f"{k} members: {median(found):.0f} member updates/s, "
+            f"{over(found, rates[1]):.3f} x one's (target 0.95)"
+        )
+
+
+def precision(folder: str) -> None:
+    """Updates/s with products in bfloat16 over those in float32, alternating."""
+    for name in ("td3", "sac"):
+        kinds = ("f32", "bf16")
+        rates = alternating({k: whole(name, SPECS[ENV], 1, precision=k) for k in kinds})
+        print(
+            f"{name}: {median(rates['bf16']):.0f} updates/s in bf16, "
+            f"{over(rates['bf16'], rates['f32']):.2f} x {median(rates['f32']):.0f} in f32"
+        )
+
+
+def alternating(cycles: dict[Any, Any]) -> dict[Any, list[float]]:
+    """Updates/s of calls that take turns, nine times."""
+    rates: dict[Any, list[float]] = {case: [] for case in cycles}
     for call, *_ in cycles.values():
         call()
     for _ in range(9):
-        for k, (call, _, updates) in cycles.items():
-            rates[k].append(updates / timed(call, 40 // k))
-    for k, found in rates.items():
-        ratio = median(a / b for a, b in zip(found, rates[1], strict=True))
-        print(
-            f"{k} members: {median(found):.0f} member updates/s, {ratio:.3f} x one's (target 0.95)"
-        )
+        for case, (call, _, updates) in cycles.items():
+            rates[case].append(updates / timed(call, max(80 // updates, 1)))
+    return rates
+
+
+def over(found: list[float], others: list[float]) -> float:
+    """The median ratio of rates that were measured side by side."""
+    return median(a / b for a, b in zip(found, others, strict=True))
 
 
 def checkpoint(folder: str) -> None:
@@ -138,7 +154,7 @@ def startup(folder: str) -> None:
     print(f"first env step: {warm:.2f} s warm (target 4), {cold:.2f} s cold (target 12)")
 
 
-PARTS = {f.__name__: f for f in (outside, members, checkpoint, startup, memory)}
+PARTS = {f.__name__: f for f in (outside, members, precision, checkpoint, startup, memory)}
 
 
 def main() -> None:

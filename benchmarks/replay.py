@@ -9,6 +9,7 @@ import argparse
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -121,6 +122,8 @@ def main() -> None:
         kind, env, steps, seed = chosen.measure
         print(time_run(KINDS[kind], env, int(steps), int(seed)))
         return
+    versions = ", ".join(f"{name} {version(name)}" for name in ("pacesetter", "jax", "numpy"))
+    print(f"{versions}; {len(os.sched_getaffinity(0))} cores\n", flush=True)
     show_alone(chosen.rows, chosen.repeats)
     if chosen.rounds:
         show_runs(chosen.env, chosen.steps, chosen.rounds)

@@ -33,6 +33,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "trust-region": [{"budget": "1M"}],
     "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "410s"}],
     "imagined": [{"budget": "45k"}],
+    "precision": [{"budget": "100k"}, {"budget": "200k"}],
     "walkers": [{"budget": "30k"}],
 }
 

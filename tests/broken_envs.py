@@ -56,6 +56,21 @@ class NanReset(Probe):
         return np.full(3, NAN, np.float32), super().reset(**options)[1]
 
 
+class ListObservation(Probe):
+    def step(self, action: Any) -> Any:
+        return [0.0, 0.0, 0.0], *super().step(action)[1:]
+
+
+class WideObservation(Probe):
+    def step(self, action: Any) -> Any:
+        return np.zeros(3), *super().step(action)[1:]
+
+
+class OutsideObservation(Probe):
+    def reset(self, **options: Any) -> Any:
+        return np.float32([0, 0, -10]), super().reset(**options)[1]
+
+
 class Reward(Probe):
     """The reward is whatever `reward` is."""
 
@@ -68,6 +83,10 @@ class Reward(Probe):
 
 class InfiniteReward(Reward):
     reward = float("inf")
+
+
+class HugeReward(Reward):
+    reward = 1e39
 
 
 class ArrayReward(Reward):
@@ -129,6 +148,48 @@ class DictAction(Probe):
 
 class InfiniteBounds(Probe):
     action_space = Box(np.float32([-np.inf, *range(40)]), np.float32([np.inf, *range(1, 41)]))
+
+
+class Precise(Probe):
+    """Its action bounds are float64, and float32 has only larger and smaller numbers."""
+
+    action_space = Box(np.array([-0.1, -1 / 3]), np.array([0.1, 0.3]), dtype=np.float64)
+
+
+class Square(Probe):
+    """Observes 3 x 2 numbers and takes 1 x 2."""
+
+    observation_space = Box(-9, 9, (3, 2), np.float32)
+    action_space = Box(-2, 2, (1, 2), np.float32)
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        return np.zeros((3, 2), np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        assert action.shape == (1, 2)
+        return np.repeat(action, 3, axis=0), 0.0, False, False, {}
+
+
+class Endless(Probe):
+    def step(self, action: Any) -> Any:
+        observation, reward, *_ = super().step(action)
+        self.point[2] = 0
+        return observation, reward, False, False, {}
+
+
+class Ageing(Probe):
+    """Pays more in every episode of its life, which no seed and no observation tells."""
+
+    lives: int = 0
+
+    def reset(self, **options: Any) -> Any:
+        self.lives += 1
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        observation, _, *rest = super().step(action)
+        return observation, float(self.lives), *rest
 
 
 class Restless(Probe):

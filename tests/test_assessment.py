@@ -119,6 +119,9 @@ def test_many_updates_are_spread_over_ticks(runs: Path, monkeypatch: pytest.Monk
     run_to_end(spread)
     assert spread.progress.updates == 60
     assert spread.progress.tick > 61
+    assert [row["updates"] for row in spread.directory.rows("eval")] == [0, 60]
+    saved, last = load(spread.directory.policy_file), spread.policy()
+    assert np.array_equal(saved(np.ones(3)), last(np.ones(3)))
     monkeypatch.undo()
     again = assessed(runs, ([5, 4, 3],), steps=61, name="again", eval_every=1000)
     run_to_end(again)

@@ -267,6 +267,12 @@ def test_config_of_a_run_makes_it_again(command: Command, here: Path) -> None:
     assert_same(first, find("multi-td3/0", "again"))
 
 
+def test_a_run_whose_time_is_up_is_finished(command: Command) -> None:
+    run = trained(command, "td3", "--steps", "1M", "--warmup", "1M", "--time", "1s")
+    assert run.rows()[-1]["step"] < 1_000_000
+    assert "finished" in command("list", "runs")
+
+
 def test_env_keyword_reaches_the_task(command: Command) -> None:
     """Twice the gain is twice the return of the same actions, in the run and for its file."""
     first = trained(command, "td3", "--steps", 1, "--name", "one")
@@ -288,7 +294,8 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--actor-learning-rate 1e-3 "
         "--critic-learning-rate 2e-3 --tau 0.01 --critics 3 --policy-delay 3 --target-noise 0.1 "
         "--target-noise-clip 0.2 --exploration ou --exploration-noise 0.3 --critic-layer-norm "
-        "--actor-layer-norm --gamma 0.9 --normalize-observation --quantiles 3 --replay uniform",
+        "--actor-layer-norm --gamma 0.9 --normalize-observation --quantiles 3 --replay uniform "
+        "--precision bf16",
         {"steps": 300, "time": 600, "checkpoint_every": 3600, "replay_size": 1000},
     ),
     "multi-td3": (

@@ -8,6 +8,8 @@ import pytest
 from broken_envs import Restless
 from conftest import TINY, run_to_end
 from pacesetter.envs import Environment, known, make
+from pacesetter.errors import TrainingError
+from pacesetter.evaluation import rollouts
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.training.trainer import Trainer
@@ -131,6 +133,26 @@ def test_actions_stay_in_random_boxes(rng: np.random.Generator) -> None:
         assert (np.abs(scaled - exact) <= slack + 1e-6 * (high - low)).all()
 
 
+def test_no_action_leaves_a_box_of_float64() -> None:
+    """Bounds such as 0.1 lie between two float32 numbers; the env itself asserts what it gets."""
+    env = world("broken_envs:Precise-v0")
+    env.reset()
+    for action in (-1, 1, 0.3):
+        env.step(np.full(2, action, np.float32))
+    box: Any = env.env.action_space
+    np.testing.assert_allclose(env.low, box.low, rtol=1e-7)
+    np.testing.assert_allclose(env.high, box.high, rtol=1e-7)
+
+
+def test_an_episode_without_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pacesetter.envs.LONGEST", 300)
+    env = world("broken_envs:Endless-v0")
+    with pytest.raises(TrainingError, match=r"not ended after 300 steps; .*max_episode_steps"):
+        rollouts(lambda observation: np.zeros(2, np.float32), env, 1)
+    limited = world("broken_envs:Endless-v0", max_episode_steps=250)
+    assert rollouts(lambda observation: np.zeros(2, np.float32), limited, 2).lengths == [250, 250]
+
+
 def test_widest_finite_box() -> None:
     """Bounds that float32 only just holds give no NaN."""
     high = np.full(2, np.finfo(np.float32).max)
@@ -205,6 +227,25 @@ def test_env_that_does_not_repeat_is_reported(runs: Any) -> None:
     assert "\n" not in note
     *_, last = resumed
     assert (last.step, resumed.finished) == (260, True)
+
+
+def test_env_that_remembers_earlier_episodes_is_reported(runs: Any) -> None:
+    """The observations repeat, but what the episode earned does not."""
+    settings = {**TINY, "steps": 260, "warmup": 260, "eval_every": 260, "name": "ageing"}
+    trainer = Trainer("td3", "broken_envs:Ageing-v0", runs=runs, **settings)
+    tick = trainer.ensemble.tick
+
+    def tick_and_stop() -> Any:
+        if trainer.progress.step == 150:
+            trainer.stop()
+        return tick()
+
+    trainer.ensemble.tick = tick_and_stop
+    run_to_end(trainer)
+    resumed = Trainer.resume(trainer.directory.path)
+    resumed.close()
+    (note,) = resumed.notes
+    assert "Ageing-v0 does not repeat" in note
 
 
 def test_known_tasks() -> None:

@@ -68,10 +68,12 @@ print(json.dumps([result.returns, heavy]))
 """
 
 
-def test_policy_needs_numpy_only(tmp_path: Path, rng: np.random.Generator) -> None:
-    """Loading, acting, evaluating and the `eval` command never import JAX."""
+@pytest.mark.parametrize("actors", [1, 3])
+def test_policy_needs_numpy_only(actors: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    """Loading, acting, evaluating and the `eval` command never import JAX; of SUNRISE's several
+    averaged actors too."""
     file = tmp_path / "policy.safetensors"
-    make_policy("Hopper-v5", rng).save(file)
+    make_policy("Hopper-v5", rng, actors=actors).save(file)
     command = [sys.executable, "-c", SCRIPT, str(file)]
     found = subprocess.run(command, capture_output=True, text=True, check=True)
     told, (returns, heavy) = (json.loads(line) for line in found.stdout.splitlines())
@@ -123,6 +125,17 @@ def test_numpy_equals_jax(norm: bool, rng: np.random.Generator) -> None:
     )
     expected = np.asarray(nets.actor(network, jnp.array(observations)))
     np.testing.assert_allclose(policy.act(observations), expected, rtol=0, atol=1e-5)
+
+
+def test_actions_have_the_shape_of_the_env(runs: Path) -> None:
+    """One observation or any batch of them, as the env gives them."""
+    settings = {**TINY, "steps": 5, "env_kwargs": {"max_episode_steps": 5}}
+    trainer = Trainer("td3", "broken_envs:Square-v0", runs=runs, **settings)
+    policy = load(run_to_end(trainer).policy_file)
+    assert policy(np.zeros((3, 2))).shape == (1, 2)
+    assert policy(np.zeros((7, 4, 3, 2))).shape == (7, 4, 1, 2)
+    with pytest.raises(UsageError, match=r"shape \(6,\) given; this policy takes \(\.\.\., 3, 2\)"):
+        policy(np.zeros(6))
 
 
 def test_ensemble_averages(rng: np.random.Generator) -> None:

@@ -109,6 +109,17 @@ def stop_at(trainer: Trainer, tick: int) -> None:
     run_to_end(trainer)
 
 
+def test_killed_before_the_first_checkpoint(runs: Path) -> None:
+    """Nothing is lost: the run starts again, and says so."""
+    whole = run_to_end(start("own-replays", runs, "whole"))
+    begun = start("own-replays", runs, "begun")
+    begun.close()
+    begun.directory.state_file.unlink()
+    resumed = Trainer.resume(begun.directory.path)
+    assert resumed.notes == ["no checkpoint yet, starting from the beginning"]
+    assert_same(whole, run_to_end(resumed))
+
+
 SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
 SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
 SLOW += ("bf16", "steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")

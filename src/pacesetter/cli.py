@@ -40,6 +40,9 @@ def main(arguments: list[str] | None = None) -> int:
     except TrainingError as error:
         print(f"pacesetter: stopped: {error}", file=sys.stderr)
         return 1
+    except MemoryError as error:
+        print(f"pacesetter: stopped: out of memory: {error}; ask for less", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:

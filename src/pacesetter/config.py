@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import AfterValidator, Field, ValidationError
 from pydantic.dataclasses import dataclass
@@ -144,7 +144,8 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     run_names, hyper_names = names_of(Run), names_of(hyper_type)
     for key in merged:
         if key not in run_names | hyper_names:
-            raise unknown("setting", key, run_names | hyper_names)
+            help_of = f"pacesetter train {name} {env} --help"
+            raise unknown("setting", key, run_names | hyper_names, help_of)
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
     if isinstance(hyper, OffPolicy):
@@ -190,6 +191,11 @@ def names_of(kind: type) -> set[str]:
 
 def build(kind: type, table: Settings) -> Any:
     """Make checked settings, or refuse them in one line that names the field."""
+    infos: dict[str, Any] = kind.__dict__["__pydantic_fields__"]
+    for key, value in table.items():  # Python, and so pydantic, takes True for 1
+        annotation = infos[key].annotation
+        if isinstance(value, bool) and {int, float} & {annotation, *get_args(annotation)}:
+            raise UsageError(f"{key}: should be a number, got {str(value).lower()}")
     try:
         return kind(**table)
     except ValidationError as error:

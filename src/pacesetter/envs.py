@@ -15,6 +15,9 @@ from pacesetter.errors import TrainingError, UsageError, unknown
 from pacesetter.policy import Floats, to_env
 from pacesetter.seeding import Stream, episode_seed
 
+LONGEST = 100_000  # steps of an episode; one that never ends would hang every evaluation
+LARGEST = float(np.finfo(np.float32).max)  # of a reward, which the replay keeps in float32
+
 
 class PaddedAnt(gymnasium.ObservationWrapper[Any, Any, Any]):
     """Ant as the -v2 papers had it: 27 numbers and 84 contact forces that were always zero."""
@@ -89,7 +92,7 @@ def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
 def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
     """A task by its Gymnasium id, or one line that says what is wrong with the id or the task."""
     plain = name.split(":")[-1]
-    if not re.search(r"-v\d+$", plain) and name not in known():
+    if not re.search(r"-v\d+$", plain, re.IGNORECASE) and name not in known():
         versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
         hint = f"; write {' or '.join(versions)}" if versions else "; such as HalfCheetah-v5"
         raise UsageError(f"env: '{name}' has no version{hint}")
@@ -120,8 +123,13 @@ def _check_space(what: str, space: Any) -> None:
 
 
 def _bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:
+    """The action bounds in float32, rounded inwards so that no action leaves a float64 box."""
     space: Any = env.action_space
-    return space.low.astype(np.float32).ravel(), space.high.astype(np.float32).ravel()
+    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite and are refused
+        low, high = (bound.astype(np.float32).ravel() for bound in (space.low, space.high))
+    low = np.where(low < space.low.ravel(), np.nextafter(low, np.float32(np.inf)), low)
+    high = np.where(high > space.high.ravel(), np.nextafter(high, np.float32(-np.inf)), high)
+    return low, high
 
 
 class Environment:
@@ -138,18 +146,21 @@ class Environment:
         self.name, self.seed, self.stream, self.index = name, seed, stream, index
         space: Any = self.env.action_space
         self.low, self.high = _bounds(self.env)
-        self.action_shape, self.action_type = space.shape, space.dtype
-        self.observation_shape = self.env.observation_space.shape
-        self.observation_size = int(np.prod(self.observation_shape or ()))
+        self.action_shape: tuple[int, ...] = space.shape
+        self.action_type = space.dtype
+        self.observation_shape: tuple[int, ...] = self.env.observation_space.shape or ()
+        self.observation_size = int(np.prod(self.observation_shape))
         self.action_size = len(self.low)
         self.episode = -1
         self.actions: list[Floats] = []
+        self.earned = 0.0  # rewards of the episode so far
+        self.given: Any = None  # the last observation as the env gave it
         self.observation = np.zeros(self.observation_size, np.float32)
 
     def reset(self, episode: int | None = None) -> Floats:
         """Enter an episode by its number, by default the next one."""
         self.episode = self.episode + 1 if episode is None else episode
-        self.actions = []
+        self.actions, self.earned = [], 0.0
         seed = episode_seed(self.seed, self.stream, self.index, self.episode)
         result: Any = self._call("reset", lambda: self.env.reset(seed=seed))
         if not (isinstance(result, tuple) and len(result) == 2):
@@ -159,6 +170,9 @@ class Environment:
 
     def step(self, action: Floats) -> Step:
         """One step with an action (A,) in [-1, 1]."""
+        if len(self.actions) >= LONGEST:
+            why = f"has not ended after {LONGEST:,} steps; give the task a limit, such as"
+            raise self._broken("episode", f"{why} --env.max_episode_steps 1000")
         self.actions.append(action)
         scaled = to_env(action, self.low, self.high)
         scaled = scaled.reshape(self.action_shape).astype(self.action_type)
@@ -170,24 +184,46 @@ class Environment:
         observation, reward, terminated, truncated, info = result
         if np.ndim(reward) != 0 or not isinstance(reward, (int, float, np.number)):
             raise self._broken("reward", f"must be one number, it is {reward!r}")
-        if not np.isfinite(reward):
-            raise self._broken("reward", f"must be finite, it is {reward}")
+        if not abs(reward) <= LARGEST:
+            raise self._broken("reward", f"must be a finite float32, it is {reward}")
         for what, flag in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(flag, (bool, np.bool_)):
                 raise self._broken(what, f"must be a bool, it is {flag!r}")
         if not isinstance(info, dict):
             raise self._broken("info", f"must be a dict, it is {info!r}")
         self.observation = self._observation(observation)
+        self.earned += float(reward)
         return Step(self.observation, float(reward), bool(terminated), bool(truncated), info)
 
     def check(self) -> None:
         """Refuse an env that breaks the API, before anything is written."""
         try:
             self.reset(0)
+            self._check_given()
             self.step(np.zeros(self.action_size, np.float32))
+            self._check_given()
         except TrainingError as error:
             raise UsageError(f"env: {error}") from None
         self.episode = -1
+
+    def _check_given(self) -> None:
+        """Refuse an observation that is not of its own space."""
+        space: Any = self.env.observation_space
+        given = self.given
+        if not isinstance(given, (np.ndarray, np.generic)):
+            kind = type(given).__name__
+            raise self._broken("observation", f"must be a NumPy array, it is a {kind}")
+        if not np.can_cast(given.dtype, space.dtype):
+            raise self._broken(
+                "observation", f"must be {space.dtype} as its space is, it is {given.dtype}"
+            )
+        outside = np.flatnonzero((given < space.low) | (given > space.high))
+        if outside.size:
+            where = int(outside[0])
+            low, value, high = (np.ravel(x)[where] for x in (space.low, given, space.high))
+            raise self._broken(
+                "observation", f"number {where} is {value}, outside its space [{low}, {high}]"
+            )
 
     def snapshot(self) -> Snapshot:
         """Where the running episode is."""
@@ -224,6 +260,7 @@ class Environment:
             raise self._broken(
                 "observation", f"must have shape {self.observation_shape}, has {shape}"
             )
+        self.given = observation
         if not np.isfinite(flat).all():
             where = int(np.flatnonzero(~np.isfinite(flat))[0])
             raise self._broken("observation", f"must be finite, number {where} is {flat[where]}")

@@ -21,7 +21,9 @@ class TrainingError(_OneLine):
     """A run that cannot go on, such as one with a NaN; its last good checkpoint is kept."""
 
 
-def unknown(kind: str, word: str, options: Iterable[str]) -> UsageError:
+def unknown(
+    kind: str, word: str, options: Iterable[str], see: str = "pacesetter list"
+) -> UsageError:
     """Refuse an unknown name, with the nearest ones that exist."""
     options = sorted(options)
     near = get_close_matches(word, options, n=3, cutoff=0.6)
@@ -30,7 +32,7 @@ def unknown(kind: str, word: str, options: Iterable[str]) -> UsageError:
     elif len(options) <= 12:
         hint = f"allowed: {', '.join(options)}"
     else:
-        hint = f"{len(options)} are known; see `pacesetter list`"
+        hint = f"{len(options)} are known; see `{see}`"
     return UsageError(f"{kind}: unknown '{word}'; {hint}")
 
 

@@ -93,7 +93,11 @@ def enter(
     """The given task or the policy's own, checked against the policy; `extra` goes to its maker."""
     about = policy.about if policy else {}
     name = env or about.get("env")
-    if not isinstance(name, str):
+    if name is not None and not isinstance(name, str):
+        raise UsageError(
+            f"env: must be an id, such as HalfCheetah-v5, it is a {type(name).__name__}"
+        )
+    if name is None:
         raise UsageError("env: none given and the policy names none")
     if env is None and ":" in name:
         raise UsageError(

@@ -23,7 +23,8 @@ class Parser(argparse.ArgumentParser):
         found, rest = self.parse_known_args(arguments)
         for word in rest:
             if word.startswith("-"):
-                raise unknown("flag", word.split("=")[0], self._option_string_actions)
+                flag = word.split("=")[0]
+                raise unknown("flag", flag, self._option_string_actions, f"{self.prog} --help")
         if rest:
             raise UsageError(f"argument: '{rest[0]}' is one too many; see `{self.prog} --help`")
         return found

@@ -121,7 +121,9 @@ def _state(run: RunDirectory) -> tuple[int, int, str]:
 def _status(run: RunDirectory, step: int, budget: int) -> str:
     if run.in_use():
         return "running"
-    return "finished" if step >= budget else "stopped"
+    limit, rows = run.settings()["time"], run.rows()
+    in_time = limit is None or not rows or rows[-1]["wall_seconds"] < limit
+    return "stopped" if step < budget and in_time else "finished"
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:

@@ -1,5 +1,6 @@
 """A trained policy as one small file, and what it does in NumPy alone: no JAX, no training code."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from pacesetter import storage
 from pacesetter.errors import UsageError
 
 Floats = NDArray[np.float32]
+Shape = tuple[int, ...]
 Layers = Sequence[dict[str, Floats]]
 KIND = "policy"
 SCHEMA = 1
@@ -80,13 +82,21 @@ class Policy:
     high: Floats
     normalizer: tuple[Floats, Floats] | None = None
     about: dict[str, Any] = field(default_factory=dict)
+    shapes: tuple[Shape, Shape] | None = None  # the env's own, of observations and actions
 
     def __call__(self, observation: Any) -> Floats:
-        """Action in the env's units, clipped to its bounds."""
-        return to_env(self.act(observation), self.low, self.high)
+        """Action in the env's units and shape, clipped to its bounds."""
+        x = np.asarray(observation, np.float32)
+        taken, given = self.shapes or ((self.actors[0][0]["kernel"].shape[0],), self.low.shape)
+        batch = x.shape[: x.ndim - len(taken)]
+        if x.shape != (*batch, *taken):
+            wanted = ", ".join(["...", *map(str, taken)])
+            raise UsageError(f"observation: shape {x.shape} given; this policy takes ({wanted})")
+        action = self.act(x.reshape(*batch, math.prod(taken)))
+        return to_env(action, self.low, self.high).reshape(*batch, *given)
 
     def act(self, observation: Any) -> Floats:
-        """Action in [-1, 1], the mean over the actors."""
+        """Action (..., A) in [-1, 1] for flat observations (..., O), the mean over the actors."""
         x = np.asarray(observation, np.float32)
         size = self.actors[0][0]["kernel"].shape[0]
         if x.shape[-1:] != (size,):
@@ -109,7 +119,8 @@ class Policy:
         if self.normalizer is not None:
             arrays |= {"mean": self.normalizer[0], "deviation": self.normalizer[1]}
         table = {"schema": SCHEMA, "activation": self.activation, "output": self.output}
-        storage.write(Path(path), KIND, storage.Content(arrays, table | {"about": self.about}))
+        table |= {"shapes": self.shapes, "about": self.about}
+        storage.write(Path(path), KIND, storage.Content(arrays, table))
 
 
 def unstack(actors: Actors) -> list[Layers]:
@@ -141,6 +152,7 @@ def load(path: str | Path) -> Policy:
             high=arrays["high"],
             normalizer=(arrays["mean"], arrays["deviation"]) if "mean" in arrays else None,
             about=table["about"],
+            shapes=_shapes(table.get("shapes")),
         )
         _check(policy, arrays)
     except storage.FAULTS as error:
@@ -174,12 +186,22 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
                 raise ValueError("a layer's bias or norm does not fit it")
         if policy.low.shape != (size,) or policy.high.shape != (size,):
             raise ValueError("its last layer does not fit its bounds")
+    sizes = [math.prod(shape) for shape in policy.shapes or ((inputs,), policy.low.shape)]
+    if sizes != [inputs, len(policy.low)]:
+        raise ValueError(f"shapes of {sizes} numbers do not fit its networks")
     if not (policy.low <= policy.high).all():
         raise ValueError("its bounds are exchanged")
     if policy.normalizer is not None:
         mean, deviation = policy.normalizer
         if mean.shape != (inputs,) or deviation.shape != (inputs,) or not (deviation > 0).all():
             raise ValueError("its normaliser does not fit")
+
+
+def _shapes(table: Any) -> tuple[Shape, Shape] | None:
+    if table is None:  # files made before there were shapes: both flat
+        return None
+    observation, action = (tuple(int(size) for size in shape) for shape in table)
+    return observation, action
 
 
 def _one_of(word: str, options: Any) -> str:

@@ -115,14 +115,17 @@ class OffPolicy(Hyper):
     """Settings of every algorithm that learns from a replay."""
 
     batch_size: Annotated[int, Tune(64, 512, log=True)] = Field(
-        256, ge=1, description="transitions in a minibatch"
+        256, ge=1, le=1_000_000, description="transitions in a minibatch"
     )
     replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
     replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
         "uniform", description="rows are drawn alike, by TD error (PER; LAP) or by episode return"
     )
     replay_exponent: Annotated[float | None, _only_with("prioritized", "lap", "return")] = Field(
-        None, ge=0, le=2, description="power of priorities, 0 is uniform; none is 0.6, for lap 0.4"
+        None,
+        ge=0,
+        le=2,
+        description="power of priorities, 0 draws uniformly; none is 0.6, for lap 0.4",
     )
     replay_importance: Annotated[float | None, _only_with("prioritized", "return")] = Field(
         None,
@@ -146,7 +149,9 @@ class OffPolicy(Hyper):
     )
     warmup: Warmup = Field(25_000, ge=0, description="first steps of all members, uniform actions")
     warmup_updates: bool = Field(False, description="update during the warm-up too")
-    updates_per_step: float = Field(1.0, gt=0, description="critic updates an own env step")
+    updates_per_step: float = Field(
+        1.0, gt=0, le=1_000, description="critic updates an own env step"
+    )
     update_at: Literal["step", "episode"] = Field(
         "step", description="as they fall due, or all at the episode's end"
     )

@@ -52,8 +52,8 @@ class Hyper(OffPolicy):
     )
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
     target_entropy: float | None = Field(None, description="nats; none is minus the action size")
-    critics: int = Field(2, ge=1, description="critics whose minimum is the target")
-    policy_delay: int = Field(3, ge=1, description="critic updates an actor update")
+    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
+    policy_delay: int = Field(3, ge=1, le=1_000, description="critic updates an actor update")
     renorm_after: Count = Field(
         100_000, ge=0, description="a network's updates with plain batch norm before renorm"
     )

@@ -54,7 +54,7 @@ class Hyper(OffPolicy):
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
     target_entropy: float | None = Field(None, description="nats; none is minus the action size")
     tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
-    critics: int = Field(2, ge=1, description="critics whose minimum is the target")
+    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
     critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
     actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
     quantiles: heads.Quantiles = Field(

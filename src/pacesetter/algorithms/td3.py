@@ -38,9 +38,9 @@ class Hyper(OffPolicy):
     actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the actor")
     critic_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step of the critics")
     tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
-    critics: int = Field(2, ge=1, description="critics whose minimum is the target")
+    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
     policy_delay: Annotated[int, Tune(1, 4)] = Field(
-        2, ge=1, description="critic updates an actor update"
+        2, ge=1, le=1_000, description="critic updates an actor update"
     )
     target_noise: Annotated[float, Tune(0.1, 0.4)] = Field(
         0.2, ge=0, description="deviation of the target action's noise"

@@ -43,9 +43,14 @@ class ByReturn:
         for number, earned in rows:
             self.scores[number % self.size] = total - earned if self.to_go else total
         self.ended.append((total, rows[-1][0]))
+        gone: list[float] = []
         while self.ended[0][1] < self.head - self.size:
-            self.ended.popleft()
-        self.ranking = np.sort(self._scored())
+            gone.append(self.ended.popleft()[0])
+        if self.to_go:
+            self.ranking = np.sort(self._sampled())
+        else:  # kept sorted: sorting all anew would cost more with every short episode
+            left = np.delete(self.ranking, [self.ranking.searchsorted(score) for score in gone])
+            self.ranking = np.insert(left, left.searchsorted(total), total)
 
     def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
         count = int(np.prod(shape))
@@ -90,10 +95,8 @@ class ByReturn:
             self.running.setdefault(int(member), []).append((int(number), float(earned)))
         self.head = window.stop
 
-    def _scored(self) -> Reals:
-        """One score an episode; to go, those of evenly spaced rows, which are sorted quickly."""
-        if not self.to_go:
-            return np.array([total for total, _ in self.ended])
+    def _sampled(self) -> Reals:
+        """Scores of evenly spaced rows, which are sorted quickly."""
         filled = min(self.head, self.size)
         scores = self.scores[: filled : -(-filled // REFERENCE)]
         return scores[~np.isnan(scores)]

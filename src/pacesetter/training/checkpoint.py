@@ -125,7 +125,10 @@ def _enter_episodes(
         member = ensemble.progress.members[index]
         if member.starting or not member.active:
             env.episode = episode
-        elif not env.restore(Snapshot(episode, actions, observation)):
+        elif not (
+            env.restore(Snapshot(episode, actions, observation))
+            and env.earned == member.episode_return
+        ):
             notes.append(
                 f"member {index}: {env.name} does not repeat an episode exactly; a new one starts"
             )

@@ -103,7 +103,10 @@ class Population:
         actors = self.algorithm.policy(state)
         scale = statistics if self.normalize else None
         layers = unstack(actors)
-        return Policy(layers, actors.activation, actors.output, env.low, env.high, scale)
+        return Policy(
+            layers, actors.activation, actors.output, env.low, env.high, scale,
+            shapes=(env.observation_shape, env.action_shape),
+        )  # fmt: skip
 
     # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
 

@@ -211,7 +211,8 @@ class Trainer:
             progress.next_train = (progress.step // TRAIN_ROW_EVERY + 1) * TRAIN_ROW_EVERY
             self._emit("train", progress.training_values(self.ensemble.loss_names))
         last = ending and progress.last_evaluation < progress.step
-        if progress.step >= progress.next_evaluation or last:
+        # The last one waits for all updates that the budget's last steps owe.
+        if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
             self._evaluate(ending)
             every = self.config.run.eval_every * self.config.unit
             progress.last_evaluation = progress.step
