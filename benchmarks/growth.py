@@ -95,7 +95,10 @@ def replay(sizes: list[int]) -> Iterator[Point]:
 
 
 def updates_per_step(sizes: list[int]) -> Iterator[Point]:
-    """Seconds of a whole training step."""
+    """Seconds of a whole training step; its floor is that of its updates."""
+    best = peak(np.random.default_rng(0))
+    _, counts, cycle = whole("td3", CHEETAH, 1)
+    work = sum(flops(p) * n for p, n in counts.items()) / cycle
     for size in sizes:
         with TemporaryDirectory() as folder:
             trainer = Trainer(
@@ -105,8 +108,9 @@ def updates_per_step(sizes: list[int]) -> Iterator[Point]:
             for _ in range(100):
                 trainer.ensemble.tick()
             took = median(timed(trainer.ensemble.tick, 100) for _ in range(3))
+            floor = size * work / median(best() for _ in range(3))
             trainer.close()
-        yield Point("updates a step", size, "step", took, None)
+        yield Point("updates a step", size, "step", took, floor)
 
 
 def measured() -> Iterator[Point]:

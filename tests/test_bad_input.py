@@ -192,7 +192,7 @@ BAD_TASKS = {
     "ListObservation": ["observation", "NumPy array", "list"],
     "WideObservation": ["observation", "float32", "float64"],
     "OutsideObservation": ["observation", "number 2 is -10.0", "[-9.0, 9.0]"],
-    "HugeReward": ["reward", "finite float32", "1e+39"],
+    "HugeReward": ["reward", "finite in float32", "1e+39"],
     "InfiniteReward": ["reward", "finite", "inf"],
     "ArrayReward": ["reward", "one number"],
     "NoReward": ["reward", "one number", "None"],

@@ -200,6 +200,7 @@ def test_list_and_show_runs(command: Command) -> None:
     assert "finished" in line
     assert f"{means[-1]:.1f}" in line
     assert any(str(second.path) in line and "120 of 120" in line for line in lines)
+    assert first.record()["backend"] == "cpu"
     text = command("show", "multi-td3/5")
     for word in ("120 of 120 steps, finished", "member_steps", "[60, 60]", "jax", "gamma"):
         assert word in text, word

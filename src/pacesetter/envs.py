@@ -185,7 +185,7 @@ class Environment:
         if np.ndim(reward) != 0 or not isinstance(reward, (int, float, np.number)):
             raise self._broken("reward", f"must be one number, it is {reward!r}")
         if not abs(reward) <= LARGEST:
-            raise self._broken("reward", f"must be a finite float32, it is {reward}")
+            raise self._broken("reward", f"must be finite in float32, it is {reward}")
         for what, flag in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(flag, (bool, np.bool_)):
                 raise self._broken(what, f"must be a bool, it is {flag!r}")

@@ -59,21 +59,21 @@ class RunDirectory:
             f"another --name, or go on with `pacesetter resume {self.path}`"
         )
 
-    def create(self, config: Config) -> None:
+    def create(self, config: Config, backend: str | None = None) -> None:
         """Make the folder and write its config; the only step that starts a run on disk."""
         try:
             self.state_file.parent.mkdir(parents=True, exist_ok=True)
             self.lock()
             self.refuse_existing(config)  # another process may have been quicker
-            table = {"schema": SCHEMA, "settings": config.settings(), **provenance()}
+            table = {"schema": SCHEMA, "settings": config.settings(), **provenance(backend)}
             self._write_config(table)
         except OSError as error:
             raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
 
-    def note_resume(self, config: Config, step: int) -> None:
+    def note_resume(self, config: Config, step: int, backend: str) -> None:
         """Add to the config that, and with what, a run was resumed; its budget may be new."""
         table = self.record()
-        resumed = [*table.get("resumed", []), {"step": step, **provenance()}]
+        resumed = [*table.get("resumed", []), {"step": step, **provenance(backend)}]
         self._write_config(table | {"settings": config.settings(), "resumed": resumed})
 
     def remove(self) -> None:
@@ -195,14 +195,15 @@ class RunDirectory:
         return False
 
 
-def provenance() -> Row:
-    """What a result needs to be repeated: command, versions, commit, machine, thread count."""
+def provenance(backend: str | None) -> Row:
+    """What a result needs to be repeated: command, versions, commit, machine, threads, backend."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
         "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
+        "backend": backend,
     }
 
 

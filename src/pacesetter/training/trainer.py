@@ -59,7 +59,7 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         _prepare_jax(self.config.run.device)
         self._begin()
-        self.directory.create(self.config)
+        self.directory.create(self.config, jax.default_backend())
         try:
             self.ensemble.open_replays(self.directory.state_file.parent)
             checkpoint.save(self.ensemble, self.directory)
@@ -97,7 +97,8 @@ class Trainer:
                 raise UsageError(
                     f"steps: the run has made {self.progress.step:,} already; give more"
                 )
-            self.directory.note_resume(self.config, self.progress.step)
+            backend = jax.default_backend()
+            self.directory.note_resume(self.config, self.progress.step, backend)
         except BaseException:
             self.directory.unlock()
             raise
