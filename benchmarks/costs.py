@@ -1,6 +1,6 @@
 """What a run spends beside its updates: outside time, members, checkpoints, memory, start-up.
 
-    python benchmarks/costs.py outside members precision checkpoint startup
+    python benchmarks/costs.py outside members precision checkpoint startup recompiles
     python benchmarks/costs.py memory        15 minutes: a full replay of 1M rows, then 200k updates
 
 Each line names its target. Nothing else should run on the machine meanwhile.
@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
+import jax
 import numpy as np
 from ceiling import SPECS, timed, whole
 
@@ -110,6 +111,25 @@ def checkpoint(folder: str) -> None:
     print(f"checkpoint: {median(took):.2f} s, {median(took) / 60:.4f} of a minute (target 0.01)")
 
 
+def recompiles(folder: str) -> None:
+    """Programs that are compiled after the first round of two members."""
+    compiled: list[bool] = []
+    rounds = 0
+
+    def listen(event: str, duration: float, **details: Any) -> None:
+        if "backend_compile" in event:
+            compiled.append(rounds > 0)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    small: dict[str, Any] = {"hidden": (8,), "batch_size": 8, "warmup": 1000, "steps": 10_000}
+    for report in Trainer("multi-td3", ENV, runs=folder, **QUIET, **small):
+        rounds += report.kind == "select"
+    print(
+        f"compiled after the first round: {sum(compiled)}, {len(compiled) - sum(compiled)} "
+        f"before; {rounds} rounds (target 0)"
+    )
+
+
 def memory(folder: str) -> None:
     """Resident memory beyond the rows, replay full, and what 200k updates add to it."""
     trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1_000_000, **QUIET)
@@ -145,16 +165,19 @@ def startup(folder: str) -> None:
     python = sys.executable
     aid = median(run(python, "-m", "pacesetter", "--help", name="help") for _ in range(3))
     colds: list[float] = []
+    warms: list[float] = []
     for number in range(3):
         environment["XDG_CACHE_HOME"] = f"{folder}/{number}"
         colds.append(run(python, "-c", FIRST_STEP, name="cold"))
-    cold = median(colds)
-    warm = median(run(python, "-c", FIRST_STEP, name="warm") for _ in range(3))
+        warms.append(run(python, "-c", FIRST_STEP, name="warm"))
+    cold, warm = median(colds), median(warms)
     print(f"--help: {aid:.2f} s (target 0.5)")
     print(f"first env step: {warm:.2f} s warm (target 4), {cold:.2f} s cold (target 12)")
 
 
-PARTS = {f.__name__: f for f in (outside, members, precision, checkpoint, startup, memory)}
+PARTS = {
+    f.__name__: f for f in (outside, members, precision, checkpoint, startup, recompiles, memory)
+}
 
 
 def main() -> None:
