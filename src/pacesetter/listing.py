@@ -121,9 +121,11 @@ def _state(run: RunDirectory) -> tuple[int, int, str]:
 def _status(run: RunDirectory, step: int, budget: int) -> str:
     if run.in_use():
         return "running"
-    limit, rows = run.settings()["time"], run.rows()
-    in_time = limit is None or not rows or rows[-1]["wall_seconds"] < limit
-    return "stopped" if step < budget and in_time else "finished"
+    if step >= budget:
+        return "finished"
+    limit = run.settings()["time"]
+    late = limit is not None and any(row["wall_seconds"] >= limit for row in run.rows()[-1:])
+    return "finished" if late else "stopped"
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:
