@@ -212,7 +212,9 @@ build = SAC
 
 def explore(actor: Layers, observation: Floats, rng: np.random.Generator) -> Floats:
     """An action (A,) drawn in NumPy."""
-    mean, log_std = np.split(forward(actor, observation), 2, axis=-1)
+    said = forward(actor, observation)
+    size = said.shape[-1] // 2  # np.split is slow for so few numbers
+    mean, log_std = said[..., :size], said[..., size:]
     noise = rng.standard_normal(mean.shape, np.float32)
     return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise)
 
