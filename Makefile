@@ -37,7 +37,7 @@ bench-speed: .venv/peers
 	NPROC=1 taskset -c 0 $(BIN)/python benchmarks/ceiling.py
 	$(BIN)/python benchmarks/ceiling.py
 	$(BIN)/python benchmarks/ceiling.py --members 2
-	$(BIN)/python benchmarks/costs.py outside members precision checkpoint startup recompiles memory
+	$(BIN)/python benchmarks/costs.py outside members precision norm checkpoint startup recompiles memory
 	$(BIN)/python benchmarks/jobs.py
 	$(BIN)/python benchmarks/models.py
 

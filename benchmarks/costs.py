@@ -1,6 +1,6 @@
 """What a run spends beside its updates: outside time, members, checkpoints, memory, start-up.
 
-    python benchmarks/costs.py outside members precision checkpoint startup recompiles
+    python benchmarks/costs.py outside members precision norm checkpoint startup recompiles
     python benchmarks/costs.py memory        15 minutes: a full replay of 1M rows, then 200k updates
 
 Each line names its target. Nothing else should run on the machine meanwhile.
@@ -74,6 +74,18 @@ def precision(folder: str) -> None:
         print(
             f"{name}: {median(rates['bf16']):.0f} updates/s in bf16, "
             f"{over(rates['bf16'], rates['f32']):.2f} x {median(rates['f32']):.0f} in f32"
+        )
+
+
+def norm(folder: str) -> None:
+    """Updates/s with layer norm in the critics over those without, alternating."""
+    for k in (1, 2):
+        kinds = {"without": False, "with": True}
+        cycles = {n: whole("td3", SPECS[ENV], k, critic_layer_norm=v) for n, v in kinds.items()}
+        rates = alternating(cycles)
+        print(
+            f"{k} members, layer norm in the critics: {median(rates['with']):.0f} member "
+            f"updates/s, {over(rates['with'], rates['without']):.2f} x those without"
         )
 
 
@@ -176,7 +188,8 @@ def startup(folder: str) -> None:
 
 
 PARTS = {
-    f.__name__: f for f in (outside, members, precision, checkpoint, startup, recompiles, memory)
+    f.__name__: f
+    for f in (outside, members, precision, norm, checkpoint, startup, recompiles, memory)
 }
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pacesetter import Trainer, algorithms
+from pacesetter import Trainer, algorithms, nets
 from pacesetter.algorithm import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.errors import UsageError
@@ -54,7 +54,7 @@ def test_both_products_of_a_gradient_round() -> None:
 
 
 def test_products_inside_loops_branches_and_rules_of_their_own() -> None:
-    """A scan, a while, a cond, a vmap and a ReLU, whose derivative JAX keeps as a rule."""
+    """A scan, a while, a cond, a vmap, and a ReLU and a layer norm, which have rules."""
     a, b = LARGE
 
     def function(a: Any, b: Any) -> Any:
@@ -62,11 +62,13 @@ def test_products_inside_loops_branches_and_rules_of_their_own() -> None:
         again = jax.lax.while_loop(lambda s: s[0] < 1, lambda s: (s[0] + 1, s[1] @ b), (0, a))[1]
         chosen = jax.lax.cond(a[0, 0] < 9, lambda: a @ b, lambda: a)
         stacked = jax.vmap(jnp.matmul)(jnp.stack([a, a]), jnp.stack([b, b]))
-        return total, again, chosen, stacked[1], jax.nn.relu(a @ b)
+        rules = jax.nn.relu(a @ b), nets.standardize(a @ b)
+        return total, again, chosen, stacked[1], *rules
 
-    *found, positive = jax.jit(bfloat16_products(function))(a, b)
+    *found, positive, standard = jax.jit(bfloat16_products(function))(a, b)
     assert all(close(each, product(a, b)) for each in found)
     assert close(positive, np.maximum(product(a, b), 0))
+    assert close(standard, jax.nn.standardize(product(a, b)))
 
 
 def test_small_products_and_other_operations_stay_as_they_are() -> None:

@@ -603,6 +603,21 @@ def test_ou_memory_is_reset_where_an_episode_starts(runs: Path) -> None:
         assert np.all(memory == 0) == start
 
 
+def test_layer_norm_and_its_gradient_are_those_of_jax(rng: np.random.Generator) -> None:
+    """Against what JAX derives of its own form; a row of equal numbers becomes zeros."""
+    rows, weights = rng.normal(size=(2, 3, 7, 9), loc=2)
+    rows[:, 0] = 5
+    with jax.enable_x64(True):
+        found, pull = jax.vjp(nets.standardize, rows)
+        expected, pull_expected = jax.vjp(partial(jax.nn.standardize, epsilon=1e-5), rows)
+        (gradient,), (gradient_expected,) = pull(weights), pull_expected(weights)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(gradient[:, 1:], gradient_expected[:, 1:], rtol=1e-11, atol=1e-11)
+    assert np.all(np.asarray(found)[:, 0] == 0)
+    flat = weights[:, 0] - weights[:, 0].mean(axis=-1, keepdims=True)
+    np.testing.assert_allclose(gradient[:, 0], flat / np.sqrt(1e-5), rtol=1e-12)
+
+
 # What leaves training, and JAX's own checks.
 
 

@@ -10,10 +10,11 @@ from typing import Any, ParamSpec, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
-from jax.extend.core.primitives import custom_jvp_call_p, dot_general_p
+from jax.extend.core.primitives import custom_jvp_call_p, custom_vjp_call_p, dot_general_p
 
 P = ParamSpec("P")
 R = TypeVar("R")
+WITH_RULES = (custom_jvp_call_p, custom_vjp_call_p)
 SMALL = 64  # products with a side below it gain nothing, and the outermost layers stay exact
 
 
@@ -43,7 +44,7 @@ def _run(program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Any]) -> 
 
 def _apply(equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
     primitive, parameters = equation.primitive, equation.params
-    if primitive is custom_jvp_call_p:  # differentiated already: its rule is of no use any more
+    if primitive in WITH_RULES:  # differentiated already: the rule is of no use any more
         inner = parameters["call_jaxpr"]
         return _run(inner.jaxpr, inner.consts, inputs)
     if primitive is dot_general_p and _is_large(equation):
