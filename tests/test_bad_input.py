@@ -108,6 +108,18 @@ BAD_FLAGS: dict[str, tuple[list[str], list[str]]] = {
         ["--n-step", "100", "--members", "11"],
         ["n_step", "100", "11", "1000"],
     ),
+    "trials that are off": (
+        ["--members", "2", "--select-every", "10k"],
+        ["select_every", "--select-on eval", "train"],
+    ),
+    "blocks longer than the run": (
+        ["--update-every", "500", "--steps", "400"],
+        ["update_every", "500", "at most 400"],
+    ),
+    "updates before what is assessed": (
+        ["--assess", "2", "--warmup-updates"],
+        ["warmup_updates", "--assess"],
+    ),
     "assessments that are off": (["--assess-after", "5k"], ["assess_after", "--assess"]),
     "config that is not there": (["--config", "no.toml"], ["config", "no.toml"]),
 }

@@ -618,6 +618,34 @@ def test_bench_of_processes(jobs: list[Job], undisturbed: Path) -> None:
     assert failure.startswith("exit 2: env: unknown 'NoSuch-v0'")
 
 
+RAY_CANCELS = """
+import _thread, signal, sys, threading, time
+from pathlib import Path
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in what a script starts in the background
+from pacesetter.study.executors import run_command
+
+def cancel():
+    while not Path(sys.argv[1]).exists():
+        time.sleep(0.05)
+    _thread.interrupt_main()
+
+threading.Thread(target=cancel, daemon=True).start()
+print(run_command(sys.argv[2:], ".")[0])
+"""
+
+
+def test_cancelled_task_saves_where_interrupts_are_ignored(jobs: list[Job]) -> None:
+    """Ray cancels by an interrupt, and a cluster may have been started without them."""
+    words = [*jobs[0].words, "--steps=1000000", "--warmup=1000000", "--eval-every=1000000", "-q"]
+    log = jobs[0].directory.metrics_file
+    done = subprocess.run(
+        [sys.executable, "-c", RAY_CANCELS, str(log), *words],
+        capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.stdout.strip() == "143", done.stderr
+    assert not jobs[0].directory.in_use()
+
+
 def test_ray_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     from pacesetter.study.executors import Ray
 

@@ -71,6 +71,21 @@ def test_products_inside_loops_branches_and_rules_of_their_own() -> None:
     assert close(standard, jax.nn.standardize(product(a, b)))
 
 
+def test_products_inside_recomputed_parts_and_solvers() -> None:
+    """jax.checkpoint holds an open program, and a linear solve a named tuple of them."""
+    a, b = LARGE
+
+    def function(a: Any) -> Any:
+        return jax.checkpoint(lambda x: jnp.tanh(x @ b))(a).sum()
+
+    found = bfloat16_products(jax.checkpoint(lambda x: x @ b))(a)
+    assert close(found, product(a, b))
+    gradient = bfloat16_products(jax.grad(function))(a)
+    assert close(gradient, product(1 - np.tanh(product(a, b)) ** 2, b.T))
+    eye = np.eye(64, dtype=np.float32)
+    assert close(bfloat16_products(jnp.linalg.solve)(eye, b), b)
+
+
 def test_small_products_and_other_operations_stay_as_they_are() -> None:
     a, b = LARGE
 

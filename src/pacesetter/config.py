@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
@@ -21,6 +21,15 @@ def _rule(value: str) -> str:
     if value not in RULES:
         raise unknown("rule", value, RULES)
     return value
+
+
+def _of_trials(value: int, info: ValidationInfo) -> int:
+    if value != SELECT_EVERY and info.data.get("select_on") == "train":
+        raise ValueError("is a setting of --select-on eval, not of train")
+    return value
+
+
+SELECT_EVERY = 5_000  # steps
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -41,7 +50,9 @@ class Run:
     select_on: Literal["train", "eval"] = Field(
         "train", description="returns of training episodes, or of extra noise-free ones (counted)"
     )
-    select_every: Count = Field(5_000, ge=1, description="steps between selections on eval")
+    select_every: Annotated[Count, AfterValidator(_of_trials)] = Field(
+        SELECT_EVERY, ge=1, description="steps between selections on eval"
+    )
     select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
     select_after: Count | None = Field(
         None, ge=0, description="steps before which nothing is selected; none is the warm-up"
@@ -149,16 +160,7 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
     if isinstance(hyper, OffPolicy):
-        if hyper.n_step * run.members > ROWS_A_TICK:
-            raise UsageError(
-                f"n_step: {hyper.n_step} with {run.members} members; "
-                f"their product must be at most {ROWS_A_TICK}"
-            )
-        if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
-            raise UsageError(
-                f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
-                "(--update-at episode, --assess) would rarely meet; choose one"
-            )
+        _refuse_what_never_meets(run, hyper)
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
     if isinstance(hyper, OnPolicy):
@@ -167,6 +169,29 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
         if run.steps < rollout:
             raise UsageError(f"steps: {run.steps} are less than one rollout of {rollout}")
     return Config(run, hyper)
+
+
+def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
+    if hyper.n_step * run.members > ROWS_A_TICK:
+        raise UsageError(
+            f"n_step: {hyper.n_step} with {run.members} members; "
+            f"their product must be at most {ROWS_A_TICK}"
+        )
+    if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
+        raise UsageError(
+            f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
+            "(--update-at episode, --assess) would rarely meet; choose one"
+        )
+    if hyper.block > run.steps:
+        raise UsageError(
+            f"update_every: a run of {run.steps} steps ends before the first block of "
+            f"{hyper.block} and would never learn; at most {run.steps}"
+        )
+    if hyper.assess and hyper.warmup_updates:
+        raise UsageError(
+            "warmup_updates: --assess waits for episodes of a policy, which the warm-up has "
+            "not; choose one"
+        )
 
 
 def _refuse_ensemble(run: Run) -> None:

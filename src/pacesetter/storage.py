@@ -83,7 +83,17 @@ def write(path: Path, kind: str, content: Content, keep: Path | None = None) -> 
         "hashes": json.dumps(hashes, sort_keys=True),
         "table_hash": hashlib.sha256(table.encode()).hexdigest(),
     }
-    write_atomically(path, save(arrays, metadata=manifest), keep)
+    write_atomically(path, _ordered(save(arrays, metadata=manifest)), keep)
+
+
+def _ordered(data: bytes) -> bytes:
+    """The file with its header in order, which safetensors shuffles: equal files, equal bytes."""
+    size = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header).encode()
+    text = text.ljust(-(-len(text) // 8) * 8)  # arrays begin at a multiple of 8
+    return len(text).to_bytes(8, "little") + text + data[8 + size :]
 
 
 def read(path: Path, kind: str) -> Content:

@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import tempfile
@@ -84,6 +85,8 @@ class Ray:
 
 def run_command(words: list[str], folder: str) -> tuple[int, str]:
     """`pacesetter WORDS` in a folder; interrupted, as Ray cancels a task, it saves and ends."""
+    # A cluster that was started in the background of a script ignores interrupts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryFile() as output:
         process = _popen(words, output, folder)
         try:
