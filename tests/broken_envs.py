@@ -150,6 +150,27 @@ class InfiniteBounds(Probe):
     action_space = Box(np.float32([-np.inf, *range(40)]), np.float32([np.inf, *range(1, 41)]))
 
 
+class IntegerAction(Probe):
+    action_space = Box(0, 10, (2,), np.int32)
+
+
+class NoNumbers(Probe):
+    observation_space = Box(-1, 1, (0,))
+
+
+class NoActions(Probe):
+    action_space = Box(-1, 1, (0,))
+
+
+class NoSpaces(Probe):
+    observation_space = None  # type: ignore[assignment]
+
+
+class RaisesInClose(Probe):
+    def close(self) -> None:
+        raise RuntimeError("the door is stuck")
+
+
 class Precise(Probe):
     """Its action bounds are float64, and float32 has only larger and smaller numbers."""
 

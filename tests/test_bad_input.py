@@ -133,6 +133,8 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "algorithm": (["train", "tdd3", TASK], ["algorithm", "tdd3", "td3"]),
     "preset": (["train", "td3-papr", TASK], ["algorithm", "td3-papr", "td3-paper"]),
     "multi of multi": (["train", "multi-multi-td3", TASK], ["algorithm", "multi-td3"]),
+    "settings first": (["train", "--seed", "1", "td3", TASK], ["ALGO", "ENV", "first"]),
+    "settings between": (["train", "td3", "--seed", "1", TASK], ["ALGO", "ENV", "first"]),
     "algorithm's module": (["train", "no_such:Class", TASK], ["algorithm", "no_such"]),
     "algorithm's class": (["train", "json:Class", TASK], ["algorithm", "json:Class"]),
     "env": (["train", "td3", "HalfCheeta-v5"], ["env", "HalfCheeta-v5", TASK]),
@@ -218,6 +220,10 @@ BAD_TASKS = {
     "DiscreteAction": ["action space", "Box", "Discrete"],
     "DictAction": ["action space", "Box", "Dict"],
     "InfiniteBounds": ["action space", "finite", "inf"],
+    "IntegerAction": ["action space", "float32", "int32"],
+    "NoNumbers": ["observation space", "at least one", "(0,)"],
+    "NoActions": ["action space", "at least one", "(0,)"],
+    "NoSpaces": ["observation space", "Box", "NoneType"],
 }
 
 Refused = Callable[..., str]
@@ -301,6 +307,29 @@ def test_broken_task(name: str, refused: Refused) -> None:
 def test_every_broken_task_differs_from_one_that_trains(whole: RunDirectory) -> None:
     """The refusals above are for the fault, not for something that all these tasks share."""
     assert [row["lengths"] for row in whole.rows() if row["kind"] == "eval"] == [[100]] * 5
+
+
+def test_env_that_fails_to_close(capsys: pytest.CaptureFixture[str]) -> None:
+    """All is done and saved by then; the fault is told in one line all the same."""
+    words = [*TRAIN[:2], "broken_envs:RaisesInClose-v0", "--steps", "20", "--eval-episodes", "1"]
+    assert main(words) == 1
+    *_, line = capsys.readouterr().err.splitlines()
+    says(line, ["RaisesInClose", "close", "the door is stuck"])
+
+
+def test_folder_of_the_user_stays(refused: Refused, here: Path) -> None:
+    """A run that cannot start removes what it made and no more."""
+    huge = ["--replay-size", "1e13", "--steps", "1e13"]
+    (here / "mine").mkdir()
+    for runs in ("mine", ".", "new/deep"):
+        says(refused(*TRAIN, *huge, "--runs", runs), ["replay"])
+        assert [path.name for path in here.iterdir()] == ["mine"]
+
+
+def test_keywords_that_no_file_can_hold(here: Path) -> None:
+    with pytest.raises(UsageError, match=r"env_kwargs: must be plain .* float32"):
+        Trainer("td3", PROBE, env_kwargs={"gain": np.float32(2)})
+    assert not [*here.iterdir()]
 
 
 def test_unwritable_runs_folder(refused: Refused, here: Path) -> None:

@@ -268,6 +268,17 @@ def test_config_of_a_run_makes_it_again(command: Command, here: Path) -> None:
     assert_same(first, find("multi-td3/0", "again"))
 
 
+def test_config_of_a_run_of_something_else(
+    command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It holds all settings, and the folder's name, so that nothing asked for would be left."""
+    file = str(trained(command, "td3", "--steps", 150).config_file)
+    assert main(["train", "multi-td3", PROBE, "--config", file, "--seed", "5"]) == 2
+    line = capsys.readouterr().err
+    assert file in line
+    assert "td3; they cannot be those of multi-td3" in line
+
+
 def test_a_run_whose_time_is_up_is_finished(command: Command) -> None:
     run = trained(command, "td3", "--steps", "1M", "--warmup", "1M", "--time", "1s")
     assert run.rows()[-1]["step"] < 1_000_000
@@ -419,10 +430,12 @@ def test_more_steps_equal_a_larger_budget(command: Command) -> None:
     assert_same(whole, parts)
 
 
-def test_resume_of_a_finished_run_changes_nothing(command: Command) -> None:
-    directory = trained(command, "td3", "--steps", 150)
+@pytest.mark.parametrize("steps", [150, 200])
+def test_resume_of_a_finished_run_changes_nothing(steps: int, command: Command) -> None:
+    """In the middle of an episode and at its end."""
+    directory = trained(command, "td3", "--steps", steps)
     before = RunDirectory(Path(shutil.copytree(directory.path, "before")))
-    assert "150 steps" in command("resume", directory.path, "-q")
+    assert f"{steps} steps" in command("resume", directory.path, "-q")
     assert_same(directory, before)
 
 

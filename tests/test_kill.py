@@ -21,7 +21,7 @@ from conftest import TINY, assert_same, run_to_end
 from pacesetter import storage
 from pacesetter.cli import main
 from pacesetter.errors import TrainingError
-from pacesetter.runs import RunDirectory
+from pacesetter.runs import RunDirectory, find_all
 from pacesetter.training import replay
 from pacesetter.training.trainer import Trainer
 
@@ -52,9 +52,9 @@ def small_ring() -> Iterator[None]:
         yield
 
 
-def start(words: list[str], runs: Path) -> subprocess.Popen[str]:
+def start(words: list[str], runs: Path, *program: str) -> subprocess.Popen[str]:
     """A command as a process of its own."""
-    command = [sys.executable, "-c", COMMAND, *words, "--runs", str(runs)]
+    command = [sys.executable, *(program or ("-c", COMMAND)), *words, "--runs", str(runs)]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     # Background jobs of some shells ignore SIGINT, and children inherit that.
     return subprocess.Popen(command, **pipes, text=True, env=dict(os.environ))
@@ -85,17 +85,9 @@ def saved_step(directory: RunDirectory) -> int:
     return sum(member["steps"] for member in progress["members"]) + progress["selection_steps"]
 
 
-def catches(process: subprocess.Popen[str], number: int) -> bool:
-    """Whether a process has a handler for a signal (Linux)."""
-    status = Path(f"/proc/{process.pid}/status").read_text()
-    found = re.search(r"^SigCgt:\s*([0-9a-f]+)", status, re.MULTILINE)
-    assert found
-    return bool(int(found[1], 16) >> (number - 1) & 1)
-
-
-def training(process: subprocess.Popen[str]) -> bool:
-    """Only training watches SIGUSR1."""
-    return catches(process, signal.SIGUSR1)
+def training(runs: Path) -> bool:
+    """Whether the only run below a folder has a checkpoint and a process that goes on with it."""
+    return any(run.in_use() and run.state_file.exists() for run in find_all(runs))
 
 
 def _has_saved_beyond(directory: RunDirectory, step: int) -> bool:
@@ -108,7 +100,7 @@ def kill_and_resume(env: str, tmp_path: Path, kills: int, seed: int) -> RunDirec
     runs, words, saved = tmp_path / "killed", KILLED[env], 0
     for number in range(kills):
         process = start(words, runs)
-        wait_for(partial(training, process), process)
+        wait_for(partial(training, runs), process)
         directory = only_run(runs)
         words = ["resume", str(directory.path)]
         if number % 3:  # the others die wherever they are, early ones before the first save
@@ -189,7 +181,7 @@ def test_signals_save_and_end(tmp_path: Path, undisturbed: Undisturbed) -> None:
     steps = [0]
     for number, code in ENDS.items():
         process = start(words, runs)
-        wait_for(partial(training, process), process)
+        wait_for(partial(training, runs), process)
         directory = only_run(runs)
         wait_for(partial(_has_saved_beyond, directory, steps[-1]), process)
         process.send_signal(number)
@@ -207,12 +199,25 @@ def test_signals_save_and_end(tmp_path: Path, undisturbed: Undisturbed) -> None:
     assert_same(undisturbed("HalfCheetah-v5"), run_to_end(Trainer.resume(directory.path)))
 
 
+@pytest.mark.parametrize("number", ENDS)
+def test_signal_before_there_is_a_run(number: signal.Signals, tmp_path: Path) -> None:
+    """While JAX is imported, which a signal must neither break nor lose: the run saves and ends."""
+    process = start(KILLED["HalfCheetah-v5"], tmp_path, "-m", "pacesetter")
+    libraries = Path(f"/proc/{process.pid}/maps")
+    wait_for(lambda: "jaxlib" in libraries.read_text(), process)
+    assert not any(find_all(tmp_path))
+    process.send_signal(number)
+    out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, err) == (ENDS[number], "")
+    assert f"saved; go on with `pacesetter resume {only_run(tmp_path).path}`" in out
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
     """The first waits for a long evaluation to end, the second for nothing; resume goes on."""
     words = ["train", "td3", "HalfCheetah-v5", "--steps", "500", *FLAGS]
     process = start([*words, "--eval-episodes", "10000"], tmp_path)
-    wait_for(partial(training, process), process)
+    wait_for(partial(training, tmp_path), process)
     process.send_signal(number)
     time.sleep(0.5)
     assert process.poll() is None

@@ -55,6 +55,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 def train(words: list[str]) -> int:
     """Train ALGO on ENV into a new run directory."""
+    return _run(_begin, words)
+
+
+def resume(words: list[str]) -> int:
+    """Go on with a run from its last checkpoint."""
+    return _run(_take_up, words)
+
+
+def _begin(words: list[str]) -> tuple["Trainer", bool]:
+    """The new run of `train WORDS`, and whether it is to be quiet."""
     from pacesetter import algorithms
     from pacesetter.config import Run, preset_layers, settle
 
@@ -63,6 +73,8 @@ def train(words: list[str]) -> int:
         command.epilog = "`pacesetter train ALGO ENV --help` shows all its settings; see also list"
         command.add_argument("ALGO", help="an algorithm or preset: `pacesetter list algorithms`")
         command.add_argument("ENV", help="a Gymnasium id such as HalfCheetah-v5, or module:Id-v0")
+        if not {"-h", "--help"} & {*words} and any(word.startswith("-") for word in words[:2]):
+            raise UsageError("train: ALGO and ENV come first, settings after them")
         command.parse(words)
     algorithm, env, rest = words[0], words[1], words[2:]
     base, _ = preset_layers(algorithm, env)
@@ -82,11 +94,11 @@ def train(words: list[str]) -> int:
         found["env_kwargs"] = env_kwargs
     from pacesetter.training.trainer import Trainer
 
-    return _train(Trainer(algorithm, env, runs=runs, config=config, **found), quiet)
+    return Trainer(algorithm, env, runs=runs, config=config, **found), quiet
 
 
-def resume(words: list[str]) -> int:
-    """Go on with a run from its last checkpoint."""
+def _take_up(words: list[str]) -> tuple["Trainer", bool]:
+    """The old run of `resume WORDS`, and whether it is to be quiet."""
     from pacesetter.runs import find
 
     command = parser("resume", "Go on with a run from its last checkpoint, bit for bit.")
@@ -102,7 +114,7 @@ def resume(words: list[str]) -> int:
     trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
     for note in trainer.notes:
         print(f"pacesetter: {note}", file=sys.stderr)
-    return _train(trainer, found.quiet)
+    return trainer, found.quiet
 
 
 def evaluate(words: list[str]) -> int:
@@ -253,14 +265,21 @@ def _add_common(command: Parser) -> None:
     command.add_argument("-q", "--quiet", action="store_true", help="no progress")
 
 
-def _train(trainer: "Trainer", quiet: bool) -> int:
+def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
     from pacesetter.sinks import console
 
     final: Any = None
-    with stopping(trainer.stop) as received, console(trainer, quiet) as sink:
-        for report in trainer:
-            sink(report)
-            final = report if report.kind == "eval" else final
+    trainers: list[Trainer] = []
+    # From before JAX is imported, which dies of an exception of ours or swallows it.
+    with stopping(lambda: [each.stop() for each in trainers]) as received:
+        trainer, quiet = begin(words)
+        trainers.append(trainer)
+        if received:
+            trainer.stop()
+        with console(trainer, quiet) as sink:
+            for report in trainer:
+                sink(report)
+                final = report if report.kind == "eval" else final
     run, step = trainer.config.run, trainer.progress.step
     result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""
     print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")

@@ -1,5 +1,6 @@
 """What to train and how: settings merged from many places and checked once."""
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -23,6 +24,14 @@ def _rule(value: str) -> str:
     return value
 
 
+def _plain(value: dict[str, Any]) -> dict[str, Any]:
+    try:
+        json.dumps(value)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"must be plain numbers, words, lists and tables: {error}") from None
+    return value
+
+
 def _of_trials(value: int, info: ValidationInfo) -> int:
     if value != SELECT_EVERY and info.data.get("select_on") == "train":
         raise ValueError("is a setting of --select-on eval, not of train")
@@ -38,7 +47,9 @@ class Run:
 
     algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
-    env_kwargs: dict[str, Any] = Field(default_factory=dict, description="given to gymnasium.make")
+    env_kwargs: Annotated[dict[str, Any], AfterValidator(_plain)] = Field(
+        default_factory=dict, description="given to gymnasium.make"
+    )
     name: str = Field(pattern=r"^\w[\w.-]*$", description="folder of the run below its env")
     steps: Count = Field(1_000_000, ge=1, description="env steps of all members together")
     time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
@@ -127,10 +138,9 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
     return name, []
 
 
-def read_file(path: Path) -> Settings:
-    """Settings from a TOML or JSON file, such as a finished run's config.json."""
-    import json
-
+def read_file(path: Path, name: str | None = None) -> Settings:
+    """Settings from a TOML or JSON file, such as a finished run's config.json, which only fits
+    the algorithm, or the name, that it is of."""
     try:
         text = path.read_text()
         table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
@@ -141,6 +151,12 @@ def read_file(path: Path) -> Settings:
     found: Any = table.get("settings", table)
     if not isinstance(found, dict):
         raise UsageError(f"config: settings in {path} must be a table")
+    whole = {found.get("algorithm"), found.get("name")} if "settings" in table else {name}
+    if name is not None and name not in whole:
+        raise UsageError(
+            f"config: {path} holds all settings of a run of {found.get('algorithm')}; "
+            f"they cannot be those of {name}"
+        )
     return {key.replace("-", "_"): value for key, value in found.items()}
 
 

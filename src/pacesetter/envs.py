@@ -103,8 +103,12 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
     except Exception as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise UsageError(f"env: cannot make '{name}': {reason}") from None
-    _check_space(f"env: {name}: observation space", env.observation_space)
-    _check_space(f"env: {name}: action space", env.action_space)
+    for what in ("observation", "action"):
+        _check_space(f"env: {name}: {what} space", getattr(env, f"{what}_space", None))
+    if not np.issubdtype(env.action_space.dtype, np.floating):
+        raise UsageError(
+            f"env: {name}: action space: must be of float32 or float64, it is {env.action_space}"
+        )
     if not np.isfinite(np.concatenate(_bounds(env))).all():
         raise UsageError(
             f"env: {name}: action space: its bounds must be finite, it is {env.action_space}"
@@ -120,6 +124,8 @@ def _check_space(what: str, space: Any) -> None:
     if not isinstance(space, Box):
         hint = " (wrap it in FlattenObservation)" if "observation" in what else ""
         raise UsageError(f"{what}: must be a Box, it is {type(space).__name__}{hint}")
+    if 0 in space.shape:
+        raise UsageError(f"{what}: must hold at least one number, its shape is {space.shape}")
 
 
 def _bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:
@@ -242,7 +248,7 @@ class Environment:
         )
 
     def close(self) -> None:
-        self.env.close()
+        self._call("close", self.env.close)
 
     def _call(self, what: str, function: Callable[[], Any]) -> Any:
         try:

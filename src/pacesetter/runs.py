@@ -38,6 +38,7 @@ class RunDirectory:
         self.state_file = path / "last" / "state.safetensors"
         self.previous_file = path / "last" / "previous.safetensors"
         self._lock: TextIOWrapper | None = None
+        self._made: list[Path] = []  # folders that `create` made, the innermost first
 
     @classmethod
     def of(cls, runs: str | Path, config: Config) -> "RunDirectory":
@@ -62,6 +63,8 @@ class RunDirectory:
     def create(self, config: Config, backend: str | None = None) -> None:
         """Make the folder and write its config; the only step that starts a run on disk."""
         try:
+            places = (self.path, *self.path.parents)
+            self._made = [folder for folder in places if not folder.exists()]
             self.state_file.parent.mkdir(parents=True, exist_ok=True)
             self.lock()
             self.refuse_existing(config)  # another process may have been quicker
@@ -80,7 +83,7 @@ class RunDirectory:
         """Undo `create` for a run that cannot start."""
         self.unlock()
         shutil.rmtree(self.path)
-        for folder in list(self.path.parents)[:3]:
+        for folder in self._made[1:]:
             if any(folder.iterdir()):
                 break
             folder.rmdir()

@@ -35,7 +35,8 @@ def save(ensemble: Learning, directory: RunDirectory) -> None:
     for index, env in enumerate(ensemble.envs):
         snapshot, member = env.snapshot(), ensemble.progress.members[index]
         if member.starting or not member.active:  # its episode is over: only its number counts
-            snapshot = Snapshot(snapshot.episode, snapshot.actions[:0], snapshot.observation * 0)
+            nothing = np.zeros_like(snapshot.observation)
+            snapshot = Snapshot(snapshot.episode, snapshot.actions[:0], nothing)
         episodes.append(snapshot.episode)
         arrays[f"env.{index}.actions"] = snapshot.actions
         arrays[f"env.{index}.observation"] = snapshot.observation

@@ -53,7 +53,7 @@ class Trainer:
 
         `settings` are those of `pacesetter train ALGO ENV --help`; `config` is a file of them.
         """
-        layers = [read_file(Path(config))] if config else []
+        layers = [read_file(Path(config), algorithm)] if config else []
         self.config = settle(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
