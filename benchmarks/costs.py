@@ -29,7 +29,8 @@ QUIET: dict[str, Any] = {"eval_every": 10**9, "eval_episodes": 1}
 FIRST_STEP = """
 from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs")
-next(iter(trainer))  # the evaluation at step 0, of ten episodes
+reports = iter(trainer)
+next(reports)  # the evaluation at step 0, of ten episodes
 trainer.ensemble.tick()
 """
 FIRST_UPDATE = """
