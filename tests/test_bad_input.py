@@ -395,6 +395,18 @@ def test_train_onto_a_run(run: RunDirectory, refused: Refused) -> None:
     says(refused(*again, "--env.gain", "2"), ["env_kwargs", "gain", "--name"])
 
 
+def test_train_beside_seeds_of_other_settings(run: RunDirectory, refused: Refused) -> None:
+    """Seeds of one name differ in their budget at most; whoever compares them relies on it."""
+    config = run.path.parent / "same.toml"
+    settings: dict[str, Any] = {**TINY, "steps": 700, "eval_every": 200}
+    lines = [f"{k} = {list(v) if isinstance(v, tuple) else v}" for k, v in settings.items()]
+    config.write_text("\n".join(lines))
+    again = ["train", "td3", PROBE, "--seed", "1", "--config", config]
+    says(refused(*again, "--gamma", "0.5"), ["td3/0", "gamma=0.99", "0.5", "--name"])
+    says(refused(*again, "--env.gain", "2"), ["td3/0", "env_kwargs", "--name"])
+    assert main([str(word) for word in [*again, "--steps", "300"]]) == 0
+
+
 def test_ambiguous_run(run: RunDirectory, refused: Refused, here: Path) -> None:
     other = here / "runs" / "broken_envs-Probe-v0" / "other" / "0"
     shutil.copytree(run.path, other)

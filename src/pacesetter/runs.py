@@ -23,6 +23,8 @@ from pacesetter.storage import TEMPORARY, write_atomically
 SCHEMA = 1
 IN_USE = "is in use by"
 PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
+# Settings in which the seeds of one name may differ.
+OF_A_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
 Row = dict[str, Any]
 
 
@@ -48,9 +50,11 @@ class RunDirectory:
 
     def refuse_existing(self, config: Config) -> None:
         """Refuse to train onto a run that is there, and say how to go on instead."""
+        new = json.loads(json.dumps(config.settings()))
         if not self.config_file.exists():
+            self._refuse_strangers(new)
             return
-        old, new = self.settings(), json.loads(json.dumps(config.settings()))
+        old = self.settings()
         differing = [key for key in new if old.get(key) != new[key]]
         if not differing:
             raise UsageError(f"run: {self.path} exists; go on with `pacesetter resume {self.path}`")
@@ -59,6 +63,20 @@ class RunDirectory:
             f"run: {self.path} exists with {key}={old.get(key)}, not {new[key]}; give this one "
             f"another --name, or go on with `pacesetter resume {self.path}`"
         )
+
+    def _refuse_strangers(self, new: Row) -> None:
+        """Refuse to stand beside seeds of the same name that were trained with other settings."""
+        for file in sorted(self.path.parent.glob("*/config.json")):
+            try:
+                old = RunDirectory(file.parent).settings()
+            except UsageError:  # damaged, which is for its own commands to say
+                continue
+            for key in [key for key in new if key in old and key not in OF_A_SEED]:
+                if old[key] != new[key]:
+                    raise UsageError(
+                        f"run: {file.parent} has {key}={old[key]}, not {new[key]}; give runs with "
+                        "other settings another --name"
+                    )
 
     def create(self, config: Config, backend: str | None = None) -> None:
         """Make the folder and write its config; the only step that starts a run on disk."""
