@@ -10,7 +10,8 @@ import pytest
 
 from pacesetter import storage
 from pacesetter.runs import RunDirectory
-from pacesetter.training.trainer import Trainer, _prepare_jax
+from pacesetter.training.backend import prepare
+from pacesetter.training.trainer import Trainer
 
 CLOCKS = ("cpu_seconds", "wall_seconds")
 TINY: dict[str, Any] = {
@@ -57,7 +58,7 @@ def run_to_end(trainer: Trainer) -> RunDirectory:
 @pytest.fixture(scope="session", autouse=True)
 def _keep_compiled() -> None:
     """Programs are kept between test runs, as a trainer keeps them."""
-    _prepare_jax("auto")
+    prepare("auto")
 
 
 @pytest.fixture

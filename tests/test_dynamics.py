@@ -20,7 +20,7 @@ from pacesetter.dynamics import (
     bounded,
     quantities,
 )
-from pacesetter.training.trainer import _prepare_jax
+from pacesetter.training.backend import prepare
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(5)
@@ -75,7 +75,7 @@ def fitted() -> fitting.Fit:
 @pytest.fixture(scope="module", autouse=True)
 def _keep_compiled() -> None:
     """Programs are kept between test runs, as a trainer keeps them."""
-    _prepare_jax("auto")
+    prepare("auto")
 
 
 # What is learned.

@@ -21,7 +21,7 @@ from pacesetter.algorithm import NO_MASK, Update
 from pacesetter.envs import Environment
 from pacesetter.policy import normalize
 from pacesetter.seeding import Stream, episode_seed
-from pacesetter.training.population import Population, inherit
+from pacesetter.training.population import KEYS, Draw, Population, inherit
 from pacesetter.training.replay import Columns
 from pacesetter.training.selection import REMEMBERED, measure
 from pacesetter.training.trainer import Report, Trainer
@@ -517,17 +517,23 @@ STILL = np.zeros(3, np.float32), np.ones(3, np.float32)
 
 
 def test_no_two_draws_of_a_run_share_a_key() -> None:
-    """Every member's init and every cycle of it."""
+    """Every member's init and every cycle of it, also where the next block of keys is made; each
+    is the run's key with its purpose, its cycle and its member folded in.
+    """
     columns = Columns(*SPEC)
     population = Population(KeyTeller(), columns, seed=0, normalize=False)
     rows = np.zeros((1, 1, columns.width), np.float32)
     states = population.init(3, same=False)
     told = [tuple(np.asarray(state.key)) for state in states]
-    for cycle in range(5):
+    cycles = [0, 1, 2, KEYS - 1, KEYS, KEYS + 1, 5 * KEYS + 3]
+    for cycle in cycles:
         for k, state in enumerate(states):
             states[k] = population.update(state, k, cycle, rows, None, STILL).state
+            folded = jax.random.fold_in(jax.random.key(0), Draw.UPDATE)
+            folded = jax.random.fold_in(jax.random.fold_in(folded, cycle), k)
+            assert np.array_equal(states[k].key, jax.random.key_data(folded))
         told += [tuple(np.asarray(state.key)) for state in states]
-    assert len(set(told)) == len(told) == 3 * (1 + 5)
+    assert len(set(told)) == len(told) == 3 * (1 + len(cycles))
 
 
 def test_members_learn_from_observations_as_they_act_on_them(rng: np.random.Generator) -> None:

@@ -11,10 +11,10 @@ import pytest
 from pacesetter import algorithms
 from pacesetter.algorithm import Spec
 from pacesetter.config import settle
+from pacesetter.training.backend import IN_PLACE, compiler_options, prepare
 from pacesetter.training.population import Population
 from pacesetter.training.replay import Columns
 from pacesetter.training.trainer import Trainer
-from pacesetter.training.trainer import _prepare_jax as prepare_jax
 
 HALF_CHEETAH = Spec(17, 6)
 WORK = {
@@ -33,7 +33,8 @@ def costs(name: str) -> dict[str, float]:
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
     rows = jax.ShapeDtypeStruct((algorithm.cycle, 256, columns.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
-    lowered = population._update.lower(state, 0, 0, rows, None, still, {}, population.key)
+    key = np.zeros(2, np.uint32)
+    lowered = population._update.lower(state, rows, None, still, {}, key)
     found: Any = lowered.compile().cost_analysis()
     return {key: found[key] / algorithm.cycle for key in ("flops", "bytes accessed")}
 
@@ -57,7 +58,7 @@ def test_programs_are_kept_apart_by_the_cores_they_were_compiled_for(
     for threads, cores in (("1", {0}), ("2", {0}), ("2", {0, 1})):
         monkeypatch.setenv("NPROC", threads)
         monkeypatch.setattr("os.sched_getaffinity", lambda process, cores=cores: cores)
-        prepare_jax("cpu")
+        prepare("cpu")
         kept.add(Path(jax.config.jax_compilation_cache_dir or ""))
     jax.config.update("jax_compilation_cache_dir", before)
     assert len(kept) == 3
@@ -109,3 +110,14 @@ def test_python_calls_of_a_step(tmp_path: Path) -> None:
         sys.setprofile(None)
     trainer.close()
     assert calls / 100 <= CALLS
+
+
+def test_updates_are_compiled_without_an_option_that_this_xla_does_not_know(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Options of XLA come and go with its releases; one that is gone is left out."""
+    assert compiler_options() == IN_PLACE
+    compiler_options.cache_clear()
+    monkeypatch.setattr("pacesetter.training.backend.IN_PLACE", {"xla_cpu_no_such_option": True})
+    assert compiler_options() is None
+    compiler_options.cache_clear()

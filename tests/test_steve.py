@@ -19,8 +19,9 @@ from pacesetter.config import settle
 from pacesetter.dynamics import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.policy import forward
+from pacesetter.training.backend import prepare
 from pacesetter.training.population import inherit
-from pacesetter.training.trainer import Trainer, _prepare_jax
+from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(3)
@@ -31,7 +32,7 @@ NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 @pytest.fixture(scope="module", autouse=True)
 def _keep_compiled() -> None:
     """Programs are kept between test runs, as a trainer keeps them."""
-    _prepare_jax("auto")
+    prepare("auto")
 
 
 def learner(name: str, **hyper: Any) -> Any:

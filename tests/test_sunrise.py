@@ -17,7 +17,8 @@ from pacesetter.config import settle
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy, forward, load, unstack
 from pacesetter.training import ensemble
-from pacesetter.training.trainer import Trainer, _prepare_jax
+from pacesetter.training.backend import prepare
+from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(3)
@@ -42,7 +43,7 @@ next_action = _jit(lambda learner, *arguments: learner.base.next_action(*argumen
 
 @pytest.fixture(scope="module", autouse=True)
 def _keep_compiled() -> None:
-    _prepare_jax("auto")
+    prepare("auto")
 
 
 def learner(name: str, spec: Spec = SPEC, **hyper: Any) -> Any:

@@ -7,6 +7,7 @@ when the round is over, all start again from the rule's choice  turn
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -282,8 +283,8 @@ class Ensemble:
         return min(self.progress.step / self.horizon, 1.0)
 
     def _check(self, k: int, losses: Floats) -> None:
-        for name, loss in zip(self.loss_names, losses, strict=True):
-            if not np.isfinite(loss):
+        for name, loss in zip(self.loss_names, losses.tolist(), strict=True):
+            if not isfinite(loss):
                 raise TrainingError(f"member {k}, step {self.progress.step}: {name} is {loss}")
 
     # Turn.

@@ -8,6 +8,7 @@ so a waiting member shifts nobody's stream and no state ever holds a key.
 
 from collections.abc import Sequence
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -18,9 +19,12 @@ from pacesetter.algorithm import Algorithm, Array, State
 from pacesetter.envs import Environment
 from pacesetter.policy import OBSERVATION_LIMIT, Floats, Policy, unstack
 from pacesetter.rules import Parents
+from pacesetter.training.backend import compiler_options
 from pacesetter.training.normalizer import Statistics
 from pacesetter.training.precision import bfloat16_products
 from pacesetter.training.replay import Columns
+
+KEYS = 1024  # made in one call: in the update itself they would come before every product
 
 
 class Draw(IntEnum):
@@ -54,8 +58,10 @@ class Population:
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
         self._acting = jax.jit(algorithm.acting)
+        self._fold = jax.jit(self._fold_keys)
+        self._keys = lru_cache(maxsize=256)(self._make_keys)
         update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
-        self._update = jax.jit(update, donate_argnums=0)
+        self._update = jax.jit(update, donate_argnums=0, compiler_options=compiler_options())
 
     def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""
@@ -79,8 +85,9 @@ class Population:
 
         `extra` are fields of the batch that are not in rows. Members may be called from threads.
         """
+        key = self._keys(member, cycle // KEYS)[cycle % KEYS]
         inputs = (rows, weight, statistics, extra or {})
-        state, losses, error, acting = self._update(state, member, cycle, *inputs, self.key)
+        state, losses, error, acting = self._update(state, *inputs, key)
         return Cycle(state, np.asarray(losses), error, acting)  # NumPy waits for the result
 
     def loss_names(
@@ -108,13 +115,20 @@ class Population:
             shapes=(env.observation_shape, env.action_shape),
         )  # fmt: skip
 
+    def _make_keys(self, member: int, block: int) -> Any:
+        first = np.uint32(block * KEYS)
+        return np.asarray(self._fold(self.key, first, member))
+
     # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
+
+    def _fold_keys(self, key: Array, first: Any, member: Any) -> Array:
+        cycles = first + jnp.arange(KEYS, dtype=jnp.uint32)
+        keys = jax.vmap(lambda cycle: _key(key, Draw.UPDATE, cycle, member))(cycles)
+        return jax.random.key_data(keys)
 
     def _update_one(
         self,
         state: State,
-        member: int,
-        cycle: int,
         rows: Array,
         weight: Array | None,
         statistics: Any,
@@ -122,7 +136,7 @@ class Population:
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
-        update = self.algorithm.update(state, batch, _key(key, Draw.UPDATE, cycle, member))
+        update = self.algorithm.update(state, batch, jax.random.wrap_key_data(key))
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
         acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))

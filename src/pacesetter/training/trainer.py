@@ -1,6 +1,5 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,11 @@ from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.policy import Policy
-from pacesetter.process import threads
 from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
+from pacesetter.training.backend import prepare
 from pacesetter.training.ensemble import Ensemble
 from pacesetter.training.iterations import Iterations
 from pacesetter.training.progress import TRAIN_ROW_EVERY, Clock, Progress
@@ -57,7 +56,7 @@ class Trainer:
         self.config = settle(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
-        _prepare_jax(self.config.run.device)
+        prepare(self.config.run.device)
         self._begin()
         self.directory.create(self.config, jax.default_backend())
         try:
@@ -86,7 +85,7 @@ class Trainer:
         if changed:
             settings = self.config.settings() | changed
             self.config = settle(self.config.run.algorithm, self.config.run.env, settings)
-        _prepare_jax(self.config.run.device)
+        prepare(self.config.run.device)
         self._begin()
         self.directory.lock()
         try:
@@ -254,24 +253,3 @@ class Trainer:
         waited = self.progress.wall_seconds - self._saved_at
         full = any(replay.must_commit for replay in self.ensemble.replays)
         return full or waited >= self.config.run.checkpoint_every
-
-
-def _prepare_jax(device: str) -> None:
-    """Choose the device and keep compiled programs, of which JAX stores none by default."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and "HOME" in os.environ:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        # XLA splits loops for the cores it compiles on, which JAX's own key for a program ignores.
-        cores = f"{threads()}-threads-{len(os.sched_getaffinity(0))}-cores"
-        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter" / cores))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    if device != "auto":
-        jax.config.update("jax_default_device", _device(device))
-
-
-def _device(kind: str) -> Any:
-    try:
-        return jax.devices(kind)[0]
-    except RuntimeError:
-        present = ", ".join(sorted({device.platform for device in jax.devices()}))
-        raise UsageError(f"device: this machine has no {kind}; it has {present}") from None

@@ -1,0 +1,47 @@
+"""What a run asks of JAX: its device, where programs are kept, how XLA compiles updates."""
+
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from pacesetter.errors import UsageError
+from pacesetter.process import threads
+
+# XLA then overwrites weights without a copy first: updates of sac are 4% quicker, of td3 1%.
+IN_PLACE = {"xla_cpu_copy_insertion_use_region_analysis": True}
+
+
+def prepare(device: str) -> None:
+    """Choose the device and keep compiled programs, of which JAX stores none by default."""
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ and "HOME" in os.environ:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        # XLA splits loops for the cores it compiles on, which JAX's own key for a program ignores.
+        cores = f"{threads()}-threads-{len(os.sched_getaffinity(0))}-cores"
+        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter" / cores))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if device != "auto":
+        jax.config.update("jax_default_device", _device(device))
+
+
+@cache
+def compiler_options() -> dict[str, Any] | None:
+    """What updates are compiled with; none where this XLA does not know it, or off the CPU."""
+    if jax.default_backend() != "cpu":
+        return None
+    try:
+        jax.jit(lambda: 0, compiler_options=IN_PLACE).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return None
+    return IN_PLACE
+
+
+def _device(kind: str) -> Any:
+    try:
+        return jax.devices(kind)[0]
+    except RuntimeError:
+        present = ", ".join(sorted({device.platform for device in jax.devices()}))
+        raise UsageError(f"device: this machine has no {kind}; it has {present}") from None
