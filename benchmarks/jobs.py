@@ -1,6 +1,6 @@
 """Whether two runs, each pinned to a core, are faster than one run on both: env steps/s of each.
 
-python benchmarks/jobs.py
+python benchmarks/jobs.py [--algorithm sac]
 
 A measurement is a process of its own; all ways take turns, on an otherwise idle machine. `bench`
 pins its runs to a core each because that was faster.
@@ -20,14 +20,14 @@ from tabulate import tabulate
 START, REPORTED = 2_000, 1_000  # 1000 steps of warm-up, then 1000 that compile and settle
 
 
-def measure(env: str, steps: int, seed: int) -> float:
-    """Env steps/s of one td3 run, an update a step, between its reports of training."""
+def measure(name: str, env: str, steps: int, seed: int) -> float:
+    """Env steps/s of one run, an update a step, between its reports of training."""
     from pacesetter import Trainer
 
     settings = {"warmup": 1_000, "eval_every": 10**9, "eval_episodes": 1, "seed": seed}
     with TemporaryDirectory() as runs:
         marks: list[tuple[int, float]] = []
-        for report in Trainer("td3", env, runs=runs, **settings):
+        for report in Trainer(name, env, runs=runs, **settings):
             if report.kind == "train" and report.step >= START:
                 marks.append((report.step, report.ledger["wall_seconds"]))
             if report.step >= START + steps:
@@ -35,9 +35,9 @@ def measure(env: str, steps: int, seed: int) -> float:
     return median((step - before) / (now - then) for (before, then), (step, now) in pairwise(marks))
 
 
-def together(env: str, steps: int, jobs: list[set[int]]) -> float:
+def together(name: str, env: str, steps: int, jobs: list[set[int]]) -> float:
     """Summed env steps/s of runs at the same time, each on its own set of cores."""
-    words = [sys.executable, __file__, "--env", env, "--steps", str(steps)]
+    words = [sys.executable, __file__, "--algorithm", name, "--env", env, "--steps", str(steps)]
     processes: list[subprocess.Popen[str]] = []
     before = os.sched_getaffinity(0)
     for seed, cores in enumerate(jobs):
@@ -51,13 +51,14 @@ def together(env: str, steps: int, jobs: list[set[int]]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--algorithm", default="td3", help="of one update a step")
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--steps", type=int, default=5_000, help="measured steps of each run")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--measure", type=int, help=argparse.SUPPRESS)
     found = parser.parse_args()
     if found.measure is not None:
-        print(measure(found.env, found.steps, found.measure))
+        print(measure(found.algorithm, found.env, found.steps, found.measure))
         return
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
@@ -71,12 +72,13 @@ def main() -> None:
     rates: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(found.rounds):
         for name, jobs in ways.items():
-            rates[name].append(together(found.env, found.steps, jobs))
+            rates[name].append(together(found.algorithm, found.env, found.steps, jobs))
     rows = [
         (name, f"{median(values):.0f}", " ".join(f"{v:.0f}" for v in values))
         for name, values in rates.items()
     ]
-    print(tabulate(rows, (f"td3 on {found.env}", "steps/s, median", "each round"), "github"))
+    header = (f"{found.algorithm} on {found.env}", "steps/s, median", "each round")
+    print(tabulate(rows, header, "github"))
     pinned, both, lone = (median(values) for values in rates.values())
     word = "faster" if pinned > both else "slower"
     print(f"two pinned runs are {word}: {pinned / both:.2f} times the steps/s of one on both cores")

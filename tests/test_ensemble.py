@@ -536,6 +536,16 @@ def test_no_two_draws_of_a_run_share_a_key() -> None:
     assert len(set(told)) == len(told) == 3 * (1 + len(cycles))
 
 
+def test_keys_stay_of_their_kind_whatever_the_default_is_later() -> None:
+    columns = Columns(*SPEC)
+    with jax.default_prng_impl("rbg"):
+        population = Population(KeyTeller(), columns, seed=0, normalize=False)
+        state = population.init(1, same=False)[0]
+    rows = np.zeros((1, 1, columns.width), np.float32)
+    key = population.update(state, 0, 0, rows, None, STILL).state.key
+    assert key.shape == state.key.shape == (4,)
+
+
 def test_members_learn_from_observations_as_they_act_on_them(rng: np.random.Generator) -> None:
     """Raw rows are scaled for the learner as an observation is for acting, cut at +-10."""
     columns = Columns(*SPEC)

@@ -31,10 +31,12 @@ NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can s
 }
 FEW = {"ensemble": 3}
 # Before renorm, values by the running statistics are not yet those of the batches that it learns.
+# Small batches' statistics would leave its values a noise of half of what is allowed.
 CROSSQ = NO_ENTROPY | {
     "critic_hidden": (64, 64),
     "tau": None,
     "steps": 2_000,
+    "batch_size": 512,
     "renorm_after": 100,
 }
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}

@@ -27,16 +27,19 @@ def prepare(device: str) -> None:
         jax.config.update("jax_default_device", _device(device))
 
 
-@cache
 def compiler_options() -> dict[str, Any] | None:
     """What updates are compiled with; none where this XLA does not know it, or off the CPU."""
-    if jax.default_backend() != "cpu":
-        return None
+    device: Any = jax.config.values["jax_default_device"] or jax.devices()[0]
+    return IN_PLACE if device.platform == "cpu" and _knows(*IN_PLACE.items()) else None
+
+
+@cache
+def _knows(*options: tuple[str, Any]) -> bool:
     try:
-        jax.jit(lambda: 0, compiler_options=IN_PLACE).lower().compile()
+        jax.jit(lambda: 0, compiler_options=dict(options)).lower().compile()
     except jax.errors.JaxRuntimeError:
-        return None
-    return IN_PLACE
+        return False
+    return True
 
 
 def _device(kind: str) -> Any:

@@ -56,10 +56,11 @@ class Population:
     ) -> None:
         self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
         self.key = jax.random.key(seed)
+        self._kind = jax.random.key_impl(self.key)
         self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
         self._acting = jax.jit(algorithm.acting)
         self._fold = jax.jit(self._fold_keys)
-        self._keys = lru_cache(maxsize=256)(self._make_keys)
+        self._keys = lru_cache(maxsize=1024)(self._make_keys)
         update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
         self._update = jax.jit(update, donate_argnums=0, compiler_options=compiler_options())
 
@@ -136,7 +137,7 @@ class Population:
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
-        update = self.algorithm.update(state, batch, jax.random.wrap_key_data(key))
+        update = self.algorithm.update(state, batch, jax.random.wrap_key_data(key, impl=self._kind))
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
         acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
