@@ -31,14 +31,14 @@ NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can s
 }
 FEW = {"ensemble": 3}
 # Before renorm, values by the running statistics are not yet those of the batches that it learns.
-# Small batches' statistics would leave its values a noise of half of what is allowed.
 CROSSQ = NO_ENTROPY | {
     "critic_hidden": (64, 64),
     "tau": None,
     "steps": 2_000,
-    "batch_size": 512,
     "renorm_after": 100,
 }
+# Small batches' statistics leave values of seldom actions a noise of what `near` allows.
+STEADY = {"crossq": {"batch_size": 512}}
 NORM = {"critic_layer_norm": True, "actor_layer_norm": True}
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
 # Actions of all kinds are seen early; later noise would keep a policy for its luck.
@@ -132,7 +132,7 @@ def test_reward_that_comes_later(algorithm: str, runs: Path) -> None:
 @both
 def test_reward_of_the_action(algorithm: str, runs: Path) -> None:
     """Reward -4 (a - .5)^2: the actor finds .5, the critic the parabola."""
-    trainer = learn(algorithm, "ActionReward-v0", runs)
+    trainer = learn(algorithm, "ActionReward-v0", runs, STEADY.get(algorithm))
     near(trainer.policy()(np.zeros(1)), 0.5)
     near(values(trainer, 0, [0.3, 0.5, 0.7]), [-0.16, 0, -0.16])
     near(values(trainer, 0, [0.0]), -1)
