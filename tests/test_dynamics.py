@@ -20,7 +20,6 @@ from pacesetter.dynamics import (
     bounded,
     quantities,
 )
-from pacesetter.training.backend import prepare
 
 SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(5)
@@ -70,12 +69,6 @@ def stacked(batch: Batch, members: int = 3) -> Any:
 @pytest.fixture(scope="module")
 def fitted() -> fitting.Fit:
     return fit(SMALL, SMALL.init(KEY), rows(3_000), KEY, batch_size=64, patience=5, epochs=60)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _keep_compiled() -> None:
-    """Programs are kept between test runs, as a trainer keeps them."""
-    prepare("auto")
 
 
 # What is learned.

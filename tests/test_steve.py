@@ -19,7 +19,6 @@ from pacesetter.config import settle
 from pacesetter.dynamics import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.policy import forward
-from pacesetter.training.backend import prepare
 from pacesetter.training.population import inherit
 from pacesetter.training.trainer import Trainer
 
@@ -27,12 +26,6 @@ SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(3)
 SMALL: dict[str, Any] = {"hidden": (12, 10), "model_hidden": (8,), "head_hidden": (6,)}
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _keep_compiled() -> None:
-    """Programs are kept between test runs, as a trainer keeps them."""
-    prepare("auto")
 
 
 def learner(name: str, **hyper: Any) -> Any:

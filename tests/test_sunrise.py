@@ -17,7 +17,6 @@ from pacesetter.config import settle
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy, forward, load, unstack
 from pacesetter.training import ensemble
-from pacesetter.training.backend import prepare
 from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
@@ -39,11 +38,6 @@ init = _jit(lambda learner, key: learner.init(key))
 update = _jit(lambda learner, *arguments: learner.update(*arguments))
 target = _jit(lambda learner, *arguments: learner.target(*arguments))
 next_action = _jit(lambda learner, *arguments: learner.base.next_action(*arguments))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _keep_compiled() -> None:
-    prepare("auto")
 
 
 def learner(name: str, spec: Spec = SPEC, **hyper: Any) -> Any:

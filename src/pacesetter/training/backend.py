@@ -10,7 +10,8 @@ import jax
 from pacesetter.errors import UsageError
 from pacesetter.process import threads
 
-# XLA then overwrites weights without a copy first: updates of sac are 4% quicker, of td3 1%.
+# XLA then overwrites weights without a copy first. Updates a second on two cores, with over
+# without: sac 1.04, td3 1.01, ddpg 0.94; on one core and for several members no difference.
 IN_PLACE = {"xla_cpu_copy_insertion_use_region_analysis": True}
 
 

@@ -56,7 +56,6 @@ class Population:
     ) -> None:
         self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
         self.key = jax.random.key(seed)
-        self._kind = jax.random.key_impl(self.key)
         self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
         self._acting = jax.jit(algorithm.acting)
         self._fold = jax.jit(self._fold_keys)
@@ -137,7 +136,8 @@ class Population:
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
-        update = self.algorithm.update(state, batch, jax.random.wrap_key_data(key, impl=self._kind))
+        whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
+        update = self.algorithm.update(state, batch, whole)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
         acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
