@@ -23,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.algorithm import Spec
+from pacesetter.algorithms.contract import Spec
 from pacesetter.config import settle
-from pacesetter.training.population import Population
-from pacesetter.training.replay import Columns
+from pacesetter.learner.compiled import Population
+from pacesetter.replay.buffer import Columns
 
 SPECS = {"HalfCheetah-v5": Spec(17, 6), "Ant-v5": Spec(105, 8), "Humanoid-v5": Spec(348, 17)}
 TARGETS = {("td3", 1, 1): 0.82, ("td3", 2, 1): 0.7, ("td3", 2, 2): 0.75}  # cores, members

@@ -118,7 +118,7 @@ def main() -> None:
 def _seconds(words: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of one command; the first also pays for the imports."""
     cpu, wall = time.process_time(), time.perf_counter()
-    from pacesetter.cli import main as pacesetter
+    from pacesetter.cli.main import main as pacesetter
 
     with contextlib.redirect_stdout(io.StringIO()):
         code = pacesetter(words)

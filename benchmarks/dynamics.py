@@ -19,10 +19,11 @@ import jax
 import numpy as np
 from tabulate import tabulate
 
-from pacesetter import fitting, policy
-from pacesetter.algorithm import Batch, Spec
+from pacesetter import policy
+from pacesetter.algorithms.contract import Batch, Spec
 from pacesetter.config import settle
-from pacesetter.dynamics import Dynamics, Models
+from pacesetter.dynamics import fit as fitting
+from pacesetter.dynamics.model import Dynamics, Models
 from pacesetter.envs import Environment
 from pacesetter.policy import Floats, Policy
 from pacesetter.seeding import Stream

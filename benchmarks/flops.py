@@ -14,10 +14,10 @@ import numpy as np
 from tabulate import tabulate
 
 from pacesetter import algorithms
-from pacesetter.algorithm import Spec
+from pacesetter.algorithms.contract import Spec
 from pacesetter.envs import Environment
+from pacesetter.replay.buffer import Columns
 from pacesetter.seeding import Stream
-from pacesetter.training.replay import Columns
 
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": ("td3", {}),

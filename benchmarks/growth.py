@@ -21,8 +21,8 @@ from ceiling import TOGETHER, alone, flops, timed, whole
 from tabulate import tabulate
 
 from pacesetter import Trainer
-from pacesetter.algorithm import Spec
-from pacesetter.training.replay import Columns, Replay
+from pacesetter.algorithms.contract import Spec
+from pacesetter.replay.buffer import Columns, Replay
 
 matplotlib.use("Agg")
 SQUARE = ((256, 256), (256, 256), (((1,), (0,)), ((), ())))

@@ -35,8 +35,8 @@ START = 2_000  # steps before the clock starts: warm-up, compilation, settling
 
 def time_alone(settings: Settings, rows: int, repeats: int) -> tuple[float, float]:
     """Median CPU microseconds of drawing and of feeding back, from a full ring."""
+    from pacesetter.replay.priorities import choose
     from pacesetter.settings import OffPolicy
-    from pacesetter.training.priorities import choose
 
     rng, drawing = np.random.default_rng(0), choose(OffPolicy(**settings), rows)
     for number in range(rows):

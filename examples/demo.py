@@ -9,6 +9,7 @@ from pathlib import Path
 from tabulate import tabulate
 
 from pacesetter import Trainer, load
+from pacesetter.cli.progress import console
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media.curve import curve
@@ -16,7 +17,6 @@ from pacesetter.media.record import record
 from pacesetter.policy import Policy
 from pacesetter.process import stopping
 from pacesetter.runs import RunDirectory
-from pacesetter.sinks import console
 
 ALGORITHM, ENV, RUNS = "demo", "HalfCheetah-v5", Path("runs")
 RUN = RUNS / ENV / ALGORITHM / "0"

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.runs import find_all
-from pacesetter.study import contents, contrasts, paper, tables
-from pacesetter.study.comparison import Comparison, compare
-from pacesetter.study.figures import pdf
-from pacesetter.study.results import compact
+from pacesetter.study.compare.comparison import Comparison, compare
+from pacesetter.study.compare.results import compact
+from pacesetter.study.report import contents, contrasts, paper, tables
+from pacesetter.study.report.figures import pdf
 
 HERE = Path(__file__).parent
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.

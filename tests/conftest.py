@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pacesetter import storage
+from pacesetter.learner.backend import prepare
 from pacesetter.runs import RunDirectory
-from pacesetter.training.backend import prepare
 from pacesetter.training.trainer import Trainer
 
 CLOCKS = ("cpu_seconds", "wall_seconds")

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from broken_envs import Restless
+
 from conftest import TINY, run_to_end
 from pacesetter.envs import Environment, known, make
 from pacesetter.errors import TrainingError

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pacesetter import algorithms
-from pacesetter.algorithm import Spec
+from pacesetter.algorithms.contract import Spec
 from pacesetter.config import settle
-from pacesetter.training.backend import IN_PLACE, compiler_options, prepare
-from pacesetter.training.population import Population
-from pacesetter.training.replay import Columns
+from pacesetter.learner.backend import IN_PLACE, compiler_options, prepare
+from pacesetter.learner.compiled import Population
+from pacesetter.replay.buffer import Columns
 from pacesetter.training.trainer import Trainer
 
 HALF_CHEETAH = Spec(17, 6)
@@ -117,5 +117,5 @@ def test_updates_are_compiled_without_an_option_that_this_xla_does_not_know(
 ) -> None:
     """Options of XLA come and go with its releases; one that is gone is left out."""
     assert compiler_options() == IN_PLACE
-    monkeypatch.setattr("pacesetter.training.backend.IN_PLACE", {"xla_cpu_no_such_option": True})
+    monkeypatch.setattr("pacesetter.learner.backend.IN_PLACE", {"xla_cpu_no_such_option": True})
     assert compiler_options() is None

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from conftest import TINY, run_to_end
-from pacesetter import nets
-from pacesetter.cli import main
+from pacesetter.cli.main import main
 from pacesetter.envs import make
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
+from pacesetter.networks import mlp
 from pacesetter.policy import Actors, Layers, Policy, load, unstack
 from pacesetter.training.trainer import Trainer
 
@@ -123,7 +123,7 @@ def test_numpy_equals_jax(norm: bool, rng: np.random.Generator) -> None:
     network = tuple(
         {name: jnp.array(array) for name, array in layer.items()} for layer in policy.actors[0]
     )
-    expected = np.asarray(nets.actor(network, jnp.array(observations)))
+    expected = np.asarray(mlp.actor(network, jnp.array(observations)))
     np.testing.assert_allclose(policy.act(observations), expected, rtol=0, atol=1e-5)
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pacesetter.evaluation import evaluate
     from pacesetter.policy import load
-    from pacesetter.study.comparison import compare
+    from pacesetter.study.compare.comparison import compare
     from pacesetter.training.trainer import Trainer
 
 __all__ = ["Trainer", "compare", "evaluate", "load"]
@@ -13,7 +13,7 @@ _HOMES = {
     "Trainer": "pacesetter.training.trainer",
     "evaluate": "pacesetter.evaluation",
     "load": "pacesetter.policy",
-    "compare": "pacesetter.study.comparison",
+    "compare": "pacesetter.study.compare.comparison",
 }
 
 

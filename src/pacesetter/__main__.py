@@ -2,6 +2,6 @@
 
 import sys
 
-from pacesetter.cli import main
+from pacesetter.cli.main import main
 
 sys.exit(main())

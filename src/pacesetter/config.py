@@ -13,8 +13,8 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
+from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import UsageError, unknown
-from pacesetter.rules import RULES
 from pacesetter.settings import ROWS_A_TICK, STRICT, Count, Duration, OffPolicy, OnPolicy, Settings
 
 
@@ -116,7 +116,7 @@ class Config(NamedTuple):
 
 def presets() -> dict[str, Settings]:
     """The shipped presets by name."""
-    return tomllib.loads(Path(__file__).with_name("presets.toml").read_text())
+    return tomllib.loads(Path(algorithms.__file__).with_name("presets.toml").read_text())
 
 
 def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:

@@ -25,10 +25,10 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import heads, nets, renorm
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import sac
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms.td3 import UNROLLED
+from pacesetter.networks import batch_renorm, critic_heads, mlp
 from pacesetter.policy import Actors, Floats, Layers
 from pacesetter.settings import STRICT, Count, OffPolicy, Width
 
@@ -65,8 +65,8 @@ class Hyper(OffPolicy):
 class State(NamedTuple):
     """One learner; critics carry a leading axis of `critics`. Networks hold their statistics."""
 
-    actor: nets.Network
-    critic: nets.Network
+    actor: mlp.Network
+    critic: mlp.Network
     log_alpha: Array
     actor_optimizer: Any
     critic_optimizer: Any
@@ -86,9 +86,9 @@ class CrossQ:
         return self.hyper.policy_delay
 
     @cached_property
-    def head(self) -> heads.Head:
+    def head(self) -> critic_heads.Head:
         """What the critics' outputs mean."""
-        return heads.choose(0, self.hyper.replay)
+        return critic_heads.choose(0, self.hyper.replay)
 
     def mask(self, rng: np.random.Generator) -> Floats:
         return NO_MASK
@@ -99,9 +99,9 @@ class CrossQ:
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
         (observation, action), hyper = self.spec, self.hyper
-        actor = renorm.init(actor_key, observation, hyper.hidden, 2 * action)
+        actor = batch_renorm.init(actor_key, observation, hyper.hidden, 2 * action)
         new_critic = partial(
-            renorm.init, inputs=observation + action, hidden=hyper.critic_hidden, outputs=1
+            batch_renorm.init, inputs=observation + action, hidden=hyper.critic_hidden, outputs=1
         )
         critic = jax.vmap(new_critic)(jax.random.split(critic_key, hyper.critics))
         log_alpha = jnp.log(jnp.asarray(hyper.initial_alpha, jnp.float32))
@@ -115,8 +115,8 @@ class CrossQ:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def acting(self, state: State) -> nets.Network:
-        return renorm.fold(state.actor)
+    def acting(self, state: State) -> mlp.Network:
+        return batch_renorm.fold(state.actor)
 
     def begin(self, acting: Layers, rng: np.random.Generator) -> tuple[()]:
         return ()
@@ -140,12 +140,12 @@ class CrossQ:
         return Update(state, {"critic_loss": critic_loss.mean(), **losses}, error)
 
     def policy(self, state: State) -> Actors:
-        return sac.mean_policy(renorm.fold(state.actor), self.spec.action_size)
+        return sac.mean_policy(batch_renorm.fold(state.actor), self.spec.action_size)
 
-    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B), by its running statistics."""
-        folded = jax.vmap(renorm.fold)(critic)
-        return nets.each(nets.outputs, folded, observation, action)[..., 0]
+        folded = jax.vmap(batch_renorm.fold)(critic)
+        return mlp.each(mlp.outputs, folded, observation, action)[..., 0]
 
     # The pieces that `update` composes.
 
@@ -153,17 +153,19 @@ class CrossQ:
         self, state: State, batch: Batch, weight: Array, key: Array
     ) -> tuple[State, Array, Array]:
         """One Adam step of all critics, with the target from the same pass; loss, |error| (B,)."""
-        following, log_prob = sac.sample(renorm.fold(state.actor), batch.next_observation, key)
+        following, log_prob = sac.sample(
+            batch_renorm.fold(state.actor), batch.next_observation, key
+        )
         inputs = jnp.concatenate(
             [
                 jnp.concatenate([batch.observation, batch.action], axis=-1),
                 jnp.concatenate([batch.next_observation, following], axis=-1),
             ]
         )
-        forward = partial(renorm.train, warm=state.updates >= self.hyper.renorm_after)
+        forward = partial(batch_renorm.train, warm=state.updates >= self.hyper.renorm_after)
 
-        def loss(critic: nets.Network) -> tuple[Array, Any]:
-            said, trained = nets.each(forward, critic, inputs)
+        def loss(critic: mlp.Network) -> tuple[Array, Any]:
+            said, trained = mlp.each(forward, critic, inputs)
             now, later = jnp.split(said, 2, axis=1)
             soft = self.head.least(later) - jnp.exp(state.log_alpha) * log_prob
             y = jax.lax.stop_gradient(batch.reward + batch.discount * soft)
@@ -172,9 +174,9 @@ class CrossQ:
 
         (value, (error, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         adam = self._adam(self.hyper.critic_learning_rate)
-        critic, optimizer = nets.descend(adam, state.critic, gradient, state.critic_optimizer)
+        critic, optimizer = mlp.descend(adam, state.critic, gradient, state.critic_optimizer)
         state = state._replace(
-            critic=renorm.with_statistics(critic, trained),
+            critic=batch_renorm.with_statistics(critic, trained),
             critic_optimizer=optimizer,
             updates=state.updates + 1,
         )
@@ -185,17 +187,17 @@ class CrossQ:
         alpha = jnp.exp(state.log_alpha)
         warm = state.updates // self.cycle > self.hyper.renorm_after
 
-        def loss(actor: nets.Network) -> tuple[Array, Any]:
-            said, trained = renorm.train(actor, batch.observation, warm)
+        def loss(actor: mlp.Network) -> tuple[Array, Any]:
+            said, trained = batch_renorm.train(actor, batch.observation, warm)
             action, log_prob = sac.sample_from(said, key)
             values = self.values(state.critic, batch.observation, action).min(axis=0)
             return (alpha * log_prob - values).mean(), (log_prob.mean(), trained)
 
         (value, (log_prob, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = self._adam(self.hyper.actor_learning_rate)
-        actor, optimizer = nets.descend(adam, state.actor, gradient, state.actor_optimizer)
+        actor, optimizer = mlp.descend(adam, state.actor, gradient, state.actor_optimizer)
         state = state._replace(
-            actor=renorm.with_statistics(actor, trained), actor_optimizer=optimizer
+            actor=batch_renorm.with_statistics(actor, trained), actor_optimizer=optimizer
         )
         return sac.fit_temperature(self, state, log_prob), {
             "actor_loss": value,

@@ -18,13 +18,13 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import trpo
-from pacesetter.dynamics import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
-from pacesetter.fitting import fit
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.dynamics.fit import fit
+from pacesetter.dynamics.model import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
+from pacesetter.networks.trust_region import Gaussian, moments
 from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
 from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
-from pacesetter.trust_region import Gaussian, moments
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -21,8 +21,8 @@ import optax
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import heads, nets
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.networks import critic_heads, mlp
 from pacesetter.policy import Actors, Floats, Layers, clip, forward
 from pacesetter.settings import STRICT, LearningRate, OffPolicy, Switch, Tau, Warmup, Width
 
@@ -57,7 +57,7 @@ class Hyper(OffPolicy):
     critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
     critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
     actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
-    quantiles: heads.Quantiles = Field(
+    quantiles: critic_heads.Quantiles = Field(
         0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
     )
     exploration: Exploration = Field(
@@ -68,9 +68,9 @@ class Hyper(OffPolicy):
 class State(NamedTuple):
     """One learner; critics carry a leading axis of `critics`."""
 
-    actor: nets.Network
-    critic: nets.Network
-    target_critic: nets.Network
+    actor: mlp.Network
+    critic: mlp.Network
+    target_critic: mlp.Network
     log_alpha: Array
     actor_optimizer: Any
     critic_optimizer: Any
@@ -87,9 +87,9 @@ class SAC:
     cycle: int = 1
 
     @cached_property
-    def head(self) -> heads.Head:
+    def head(self) -> critic_heads.Head:
         """What the critics' outputs mean."""
-        return heads.choose(self.hyper.quantiles, self.hyper.replay)
+        return critic_heads.choose(self.hyper.quantiles, self.hyper.replay)
 
     def mask(self, rng: np.random.Generator) -> Floats:
         return NO_MASK
@@ -98,7 +98,7 @@ class SAC:
         actor_key, critic_key = jax.random.split(key)
         observation, action = self.spec
         hyper = self.hyper
-        actor = nets.init(
+        actor = mlp.init(
             actor_key, observation, hyper.hidden, 2 * action, layer_norm=hyper.actor_layer_norm
         )
         critic = jax.vmap(self._new_critic)(jax.random.split(critic_key, hyper.critics))
@@ -114,7 +114,7 @@ class SAC:
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def acting(self, state: State) -> nets.Network:
+    def acting(self, state: State) -> mlp.Network:
         return state.actor
 
     def begin(self, acting: Layers, rng: np.random.Generator) -> tuple[()]:
@@ -144,7 +144,7 @@ class SAC:
     def target(self, state: State, batch: Batch, key: Array) -> Array:
         """Soft target y (B,), of quantiles (B, M)."""
         action, bonus = self.next_action(state, batch.next_observation, key)
-        said = nets.each(nets.outputs, state.target_critic, batch.next_observation, action)
+        said = mlp.each(mlp.outputs, state.target_critic, batch.next_observation, action)
         following = self.head.least(said).T + bonus  # rows last, for quantiles too
         return jax.lax.stop_gradient(batch.reward + batch.discount * following).T
 
@@ -153,23 +153,23 @@ class SAC:
         action, log_prob = sample(state.actor, observation, key)
         return action, -jnp.exp(state.log_alpha) * log_prob
 
-    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
-        return self.head.value(nets.each(nets.outputs, critic, observation, action))
+        return self.head.value(mlp.each(mlp.outputs, critic, observation, action))
 
     def fit_critic(
         self, state: State, batch: Batch, y: Array, weight: Array
     ) -> tuple[State, Array, Array]:
         """One Adam step of all critics, one soft step of their targets; loss and |error| (B,)."""
 
-        def loss(critic: nets.Network) -> tuple[Array, Array]:
-            said = nets.each(nets.outputs, critic, batch.observation, batch.action)
+        def loss(critic: mlp.Network) -> tuple[Array, Array]:
+            said = mlp.each(mlp.outputs, critic, batch.observation, batch.action)
             losses, error = self.head.loss(said, y)
             return (weight * losses).mean(axis=1).sum(), error.max(axis=0)
 
         (value, error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         adam = optax.adam(self.hyper.critic_learning_rate)
-        critic, optimizer = nets.descend(adam, state.critic, gradient, state.critic_optimizer)
+        critic, optimizer = mlp.descend(adam, state.critic, gradient, state.critic_optimizer)
         state = state._replace(
             critic=critic,
             critic_optimizer=optimizer,
@@ -184,21 +184,21 @@ class SAC:
         """One Adam step of the actor on the given critics, and one of the temperature."""
         alpha = jnp.exp(state.log_alpha)
 
-        def loss(actor: nets.Network) -> tuple[Array, Array]:
+        def loss(actor: mlp.Network) -> tuple[Array, Array]:
             action, log_prob = sample(actor, batch.observation, key)
             values = self.values(state.critic, batch.observation, action).min(axis=0)
             return (weight * (alpha * log_prob - values)).mean(), (weight * log_prob).mean()
 
         (value, log_prob), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = optax.adam(self.hyper.actor_learning_rate)
-        actor, optimizer = nets.descend(adam, state.actor, gradient, state.actor_optimizer)
+        actor, optimizer = mlp.descend(adam, state.actor, gradient, state.actor_optimizer)
         state = state._replace(actor=actor, actor_optimizer=optimizer)
         losses = {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
         return fit_temperature(self, state, log_prob, jnp.mean(weight)), losses
 
-    def _new_critic(self, key: Array) -> nets.Network:
+    def _new_critic(self, key: Array) -> mlp.Network:
         inputs = self.spec.observation_size + self.spec.action_size
-        return nets.init(
+        return mlp.init(
             key,
             inputs,
             self.hyper.hidden,
@@ -219,7 +219,7 @@ def explore(actor: Layers, observation: Floats, rng: np.random.Generator) -> Flo
     return np.tanh(mean + np.exp(clip(log_std, *LOG_STD_RANGE)) * noise)
 
 
-def mean_policy(actor: nets.Network, size: int) -> Actors:
+def mean_policy(actor: mlp.Network, size: int) -> Actors:
     """The deterministic action (size,) is the tanh of the mean."""
     *hidden, last = actor
     mean = {name: value[..., :size] for name, value in last.items()}
@@ -235,13 +235,13 @@ def fit_temperature(learner: Any, state: Any, log_prob: Array, share: Array | fl
     wanted = -learner.spec.action_size if hyper.target_entropy is None else hyper.target_entropy
     excess = -log_prob - share * wanted  # d/dlog_alpha of log_alpha * excess entropy
     adam = optax.adam(hyper.alpha_learning_rate)
-    log_alpha, optimizer = nets.descend(adam, state.log_alpha, excess, state.alpha_optimizer)
+    log_alpha, optimizer = mlp.descend(adam, state.log_alpha, excess, state.alpha_optimizer)
     return state._replace(log_alpha=log_alpha, alpha_optimizer=optimizer)
 
 
-def sample(actor: nets.Network, observation: Array, key: Array) -> tuple[Array, Array]:
+def sample(actor: mlp.Network, observation: Array, key: Array) -> tuple[Array, Array]:
     """An action (..., A) of the squashed Gaussian and its log-probability (...) in [-1, 1]."""
-    return sample_from(nets.apply(actor, observation), key)
+    return sample_from(mlp.apply(actor, observation), key)
 
 
 def sample_from(said: Array, key: Array) -> tuple[Array, Array]:

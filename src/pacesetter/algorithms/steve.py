@@ -18,11 +18,11 @@ import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import nets
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
 from pacesetter.algorithms import ddpg, td3
-from pacesetter.dynamics import Dynamics, Models
-from pacesetter.exploration import Kind
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.dynamics.model import Dynamics, Models
+from pacesetter.networks import mlp
+from pacesetter.networks.exploration import Kind
 from pacesetter.policy import Actors, Floats
 from pacesetter.settings import STRICT, Width
 
@@ -85,10 +85,10 @@ class Hyper(Expansion, ddpg.Hyper):
 class State(NamedTuple):
     """A TD3 learner's fields, critics (members x twins) on a leading axis, and the models."""
 
-    actor: nets.Network
-    critic: nets.Network
-    target_actor: nets.Network
-    target_critic: nets.Network
+    actor: mlp.Network
+    critic: mlp.Network
+    target_actor: mlp.Network
+    target_critic: mlp.Network
     models: Models
     actor_optimizer: Any
     critic_optimizer: Any
@@ -193,7 +193,7 @@ class STEVE:
         values = self.values(state.target_critic, observation, action)
         return action, values.reshape(-1, self.hyper.critics, len(observation)).min(axis=1)
 
-    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
         return self.base.values(critic, observation, action)
 

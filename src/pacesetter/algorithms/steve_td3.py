@@ -9,8 +9,8 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithm import Spec
 from pacesetter.algorithms import steve, td3
+from pacesetter.algorithms.contract import Spec
 from pacesetter.settings import STRICT
 
 

@@ -21,10 +21,10 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import nets
-from pacesetter.algorithm import Array, Batch, Spec, State, Update
 from pacesetter.algorithms import sac
+from pacesetter.algorithms.contract import Array, Batch, Spec, State, Update
 from pacesetter.algorithms.td3 import UNROLLED
+from pacesetter.networks import mlp
 from pacesetter.policy import Actors, Floats, clip, forward
 from pacesetter.settings import STRICT, Count, only
 
@@ -101,7 +101,7 @@ Ask = Callable[[Any, Array, Array], Array]
 def at_each_action(ask: Ask, critic: Any, observation: Array, action: Array) -> tuple[Array, Array]:
     """Values of member i at its own action (N, critics, B); of all at i's (N, critics, N, B)."""
     everyone = jax.vmap(ask)
-    values = [everyone(critic, *nets.apart(len(action), (observation, one))) for one in action]
+    values = [everyone(critic, *mlp.apart(len(action), (observation, one))) for one in action]
     own = jnp.stack([value[i] for i, value in enumerate(values)])
     return own, jnp.stack(values, axis=2)
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithm import Array, Batch, Spec
 from pacesetter.algorithms import sunrise, td3
+from pacesetter.algorithms.contract import Array, Batch, Spec
 from pacesetter.settings import STRICT
 
 

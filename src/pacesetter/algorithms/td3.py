@@ -19,9 +19,9 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import heads, nets
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.exploration import ADAPT_EVERY, KINDS, Kind, adapt_sigma, first_sigma
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.networks import critic_heads, mlp
+from pacesetter.networks.exploration import ADAPT_EVERY, KINDS, Kind, adapt_sigma, first_sigma
 from pacesetter.policy import Actors, Floats
 from pacesetter.settings import STRICT, LearningRate, OffPolicy, Switch, Tau, Tune, Width
 
@@ -48,7 +48,7 @@ class Hyper(OffPolicy):
     target_noise_clip: float = Field(0.5, ge=0, description="bound of the target action's noise")
     critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
     actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
-    quantiles: heads.Quantiles = Field(
+    quantiles: critic_heads.Quantiles = Field(
         0, description="quantiles that a critic learns, 25 is usual; 0 is the mean alone"
     )
     exploration: Kind = Field("gaussian", description="noise on actions, or on the actor's weights")
@@ -60,10 +60,10 @@ class Hyper(OffPolicy):
 class State(NamedTuple):
     """One learner; critics carry a leading axis of `critics`."""
 
-    actor: nets.Network
-    critic: nets.Network
-    target_actor: nets.Network
-    target_critic: nets.Network
+    actor: mlp.Network
+    critic: mlp.Network
+    target_actor: mlp.Network
+    target_critic: mlp.Network
     actor_optimizer: Any
     critic_optimizer: Any
     updates: Array
@@ -82,9 +82,9 @@ class TD3:
     climbed: tuple[int, ...] = (0,)
 
     @cached_property
-    def head(self) -> heads.Head:
+    def head(self) -> critic_heads.Head:
         """What the critics' outputs mean."""
-        return heads.choose(self.hyper.quantiles, self.hyper.replay)
+        return critic_heads.choose(self.hyper.quantiles, self.hyper.replay)
 
     @property
     def cycle(self) -> int:
@@ -160,16 +160,16 @@ class TD3:
     def next_action(self, state: State, observation: Array, key: Array) -> Array:
         """The target actor's action (B, A) under clipped noise, which a target asks about."""
         limit = self.hyper.target_noise_clip
-        clean = nets.actor(state.target_actor, observation)
+        clean = mlp.actor(state.target_actor, observation)
         noise = self.hyper.target_noise * jax.random.normal(key, clean.shape)
         return jnp.clip(clean + jnp.clip(noise, -limit, limit), -1, 1)
 
-    def outputs(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def outputs(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """All that every critic says (critics, B, M)."""
-        one = partial(nets.outputs, action_layer=self.action_layer)
-        return nets.each(one, critic, observation, action)
+        one = partial(mlp.outputs, action_layer=self.action_layer)
+        return mlp.each(one, critic, observation, action)
 
-    def values(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
         return self.head.value(self.outputs(critic, observation, action))
 
@@ -178,12 +178,12 @@ class TD3:
     ) -> tuple[State, Array, Array]:
         """One Adam step of all critics towards y; the loss and each row's largest |error| (B,)."""
 
-        def loss(critic: nets.Network) -> tuple[Array, Array]:
+        def loss(critic: mlp.Network) -> tuple[Array, Array]:
             losses, error = self.head.loss(self.outputs(critic, batch.observation, batch.action), y)
             return (weight * losses).mean(axis=1).sum(), error.max(axis=0)
 
         (value, error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
-        critic, optimizer = nets.descend(
+        critic, optimizer = mlp.descend(
             self._critic_adam, state.critic, gradient, state.critic_optimizer
         )
         state = state._replace(critic=critic, critic_optimizer=optimizer, updates=state.updates + 1)
@@ -194,12 +194,12 @@ class TD3:
     ) -> tuple[State, Array]:
         """One Adam step of the actor up what it climbs, then one soft step of all targets."""
 
-        def loss(actor: nets.Network) -> Array:
-            action = nets.actor(actor, batch.observation)
+        def loss(actor: mlp.Network) -> Array:
+            action = mlp.actor(actor, batch.observation)
             return -(weight * self.climbed_value(state.critic, batch.observation, action)).mean()
 
         value, gradient = jax.value_and_grad(loss)(state.actor)
-        actor, optimizer = nets.descend(
+        actor, optimizer = mlp.descend(
             self._actor_adam, state.actor, gradient, state.actor_optimizer
         )
         soften: Callable[..., Any] = partial(optax.incremental_update, step_size=self.hyper.tau)
@@ -222,20 +222,20 @@ class TD3:
         )
         return state._replace(sigma=sigma)
 
-    def climbed_value(self, critic: nets.Network, observation: Array, action: Array) -> Array:
+    def climbed_value(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """The mean value (B,) by the critics that the actor climbs, in TD3 the first alone."""
         ones = [jax.tree.map(lambda x, i=i: x[i], critic) for i in self.climbed]
-        said = [nets.outputs(one, observation, action, self.action_layer) for one in ones]
+        said = [mlp.outputs(one, observation, action, self.action_layer) for one in ones]
         values = [self.head.value(each) for each in said]
         return sum(values[1:], values[0]) / len(values)
 
-    def _new_actor(self, key: Array) -> nets.Network:
+    def _new_actor(self, key: Array) -> mlp.Network:
         sizes = (self.spec.observation_size, self.hyper.hidden, self.spec.action_size)
         norm = self.hyper.actor_layer_norm
-        return nets.init(key, *sizes, layer_norm=norm, output_bound=self.output_bound)
+        return mlp.init(key, *sizes, layer_norm=norm, output_bound=self.output_bound)
 
-    def _new_critic(self, key: Array) -> nets.Network:
-        return nets.init(
+    def _new_critic(self, key: Array) -> mlp.Network:
+        return mlp.init(
             key,
             self.spec.observation_size,
             self.hyper.hidden,

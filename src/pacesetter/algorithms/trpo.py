@@ -20,11 +20,9 @@ from jax.scipy.sparse.linalg import cg
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter import nets
-from pacesetter.algorithm import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.policy import Actors, Floats, forward
-from pacesetter.settings import STRICT, OnPolicy, Width
-from pacesetter.trust_region import (
+from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.networks import mlp
+from pacesetter.networks.trust_region import (
     Gaussian,
     Moments,
     fisher_product,
@@ -33,6 +31,8 @@ from pacesetter.trust_region import (
     log_probability,
     moments,
 )
+from pacesetter.policy import Actors, Floats, forward
+from pacesetter.settings import STRICT, OnPolicy, Width
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -56,7 +56,7 @@ class State(NamedTuple):
     """One learner; the critic's output is in units of the deviation of all returns so far."""
 
     actor: Gaussian
-    critic: nets.Network
+    critic: mlp.Network
     critic_optimizer: Any
     returns: Array  # (3,): count, mean and squared deviations of the critic's targets so far
     updates: Array
@@ -76,10 +76,10 @@ class TRPO:
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
         (observation, action), hidden = self.spec, self.hyper.hidden
-        critic = nets.orthogonal(critic_key, observation, hidden, 1, output_gain=1.0)
+        critic = mlp.orthogonal(critic_key, observation, hidden, 1, output_gain=1.0)
         return State(
             actor=Gaussian(
-                nets.orthogonal(actor_key, observation, hidden, action, output_gain=0.01),
+                mlp.orthogonal(actor_key, observation, hidden, action, output_gain=0.01),
                 jnp.full(action, np.log(self.hyper.initial_std), jnp.float32),
             ),
             critic=critic,
@@ -130,7 +130,7 @@ class TRPO:
 
     def values(self, state: State, observation: Array) -> Array:
         """V (...) of observations (..., O), in units of reward."""
-        scaled = nets.apply(state.critic, observation, jnp.tanh)[..., 0]
+        scaled = mlp.apply(state.critic, observation, jnp.tanh)[..., 0]
         return scaled * deviation(state.returns)
 
     def fit_actor(
@@ -185,13 +185,13 @@ class TRPO:
         returns = add_moments(state.returns, targets)
         scaled = targets / deviation(returns)
 
-        def loss(critic: nets.Network, rows: Array) -> Array:
-            values = nets.apply(critic, observation[rows], jnp.tanh)[..., 0]
+        def loss(critic: mlp.Network, rows: Array) -> Array:
+            values = mlp.apply(critic, observation[rows], jnp.tanh)[..., 0]
             return ((values - scaled[rows]) ** 2).mean()
 
         def step(carry: Any, rows: Array) -> tuple[Any, Array]:
             value, gradient = jax.value_and_grad(loss)(carry[0], rows)
-            return nets.descend(self._adam, carry[0], gradient, carry[1]), value
+            return mlp.descend(self._adam, carry[0], gradient, carry[1]), value
 
         def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
             order = jax.random.permutation(key, len(targets))

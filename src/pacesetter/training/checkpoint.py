@@ -8,14 +8,14 @@ import jax
 import numpy as np
 
 from pacesetter import storage
+from pacesetter.ensemble.members import Ensemble
+from pacesetter.ensemble.progress import Progress
 from pacesetter.envs import Snapshot
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, threads
 from pacesetter.storage import Arrays, Content
-from pacesetter.training.ensemble import Ensemble
-from pacesetter.training.iterations import Iterations
-from pacesetter.training.progress import Progress
+from pacesetter.training.on_policy import Iterations
 
 KIND = "checkpoint"
 SCHEMA = 3

@@ -9,8 +9,8 @@ from pacesetter.config import Config
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
 from pacesetter.policy import Floats
+from pacesetter.replay.buffer import UNCOMMITTED, Columns, Replay
 from pacesetter.seeding import Stream
-from pacesetter.training.replay import UNCOMMITTED, Columns, Replay
 
 Data = tuple[Floats, dict[str, Any]]  # rows and the batch's other fields
 FEWEST = 250  # rows, of which a fifth is held out by a fit

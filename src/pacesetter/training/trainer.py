@@ -8,18 +8,18 @@ from typing import Any, Self
 import jax
 
 from pacesetter.config import read_file, settle
+from pacesetter.ensemble.members import Ensemble
+from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
+from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find, versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
-from pacesetter.training.backend import prepare
-from pacesetter.training.ensemble import Ensemble
-from pacesetter.training.iterations import Iterations
-from pacesetter.training.progress import TRAIN_ROW_EVERY, Clock, Progress
+from pacesetter.training.on_policy import Iterations
 
 
 @dataclass(frozen=True)

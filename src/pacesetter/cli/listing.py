@@ -1,0 +1,133 @@
+"""What `list` and `show` print, as lines."""
+
+import inspect
+from typing import Any
+
+from tabulate import tabulate
+
+from pacesetter.errors import UsageError
+from pacesetter.runs import RunDirectory, find_all
+
+SHOWN_EVALUATIONS = 5
+
+
+def algorithms() -> list[str]:
+    """Algorithms and what each is, with the ensemble form of each."""
+    from pacesetter.algorithms import TABLE, alone, names, plugins
+
+    rows = [(name, entry.help) for name, entry in TABLE.items()]
+    rows += [(name, target) for name, target in plugins().items()]
+    several = [name for name in names() if not alone(name)]
+    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
+    return _table(rows)
+
+
+def envs() -> list[str]:
+    """The walkers by id, and what else `train` takes."""
+    from pacesetter.envs import known
+
+    walkers = ("HalfCheetah", "Walker2d", "Ant", "Humanoid", "Hopper", "Swimmer")
+    found = [name for name in known() if name.split("-")[0] in walkers or "pacesetter/" in name]
+    return [*found, "any other Gymnasium id with Box observations and actions, or module:Id-v0"]
+
+
+def rules() -> list[str]:
+    """Selection rules."""
+    from pacesetter.ensemble.rules import RULES
+
+    return _table(
+        [(name, (inspect.getdoc(rule) or "").split("\n")[0]) for name, rule in RULES.items()]
+    )
+
+
+def presets() -> list[str]:
+    """Presets and where their values come from."""
+    from pacesetter.config import presets
+
+    return _table([(name, table["help"], table["source"]) for name, table in presets().items()])
+
+
+def suites() -> list[str]:
+    """What `bench` ships, how many runs each is, and what it is for."""
+    from pacesetter.study.bench.suite import count, load, shipped
+
+    found = [load(name) for name in shipped()]
+    return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
+
+
+def runs(folder: str) -> list[str]:
+    """Runs below a folder: how far each is and how its champion does."""
+    rows: list[tuple[Any, ...]] = []
+    for run in find_all(folder):
+        try:
+            step, budget, result = _state(run)
+        except (UsageError, KeyError, TypeError) as error:
+            rows.append((run.path, "-", f"damaged or foreign: {error}", "-"))
+            continue
+        rows.append((run.path, f"{step:,} of {budget:,}", _status(run, step, budget), result))
+    if not rows:
+        return [f"no runs below {folder}"]
+    return _table(rows, ("run", "steps", "state", "return"))
+
+
+def describe(run: RunDirectory) -> list[str]:
+    """One run: where it stands, its last evaluations, what it spent, its settings and versions."""
+    try:
+        return _describe(run)
+    except (KeyError, TypeError) as error:
+        raise UsageError(f"{run.path}: damaged or foreign: {error}") from None
+
+
+def _describe(run: RunDirectory) -> list[str]:
+    record = run.record()
+    step, budget, _ = _state(run)
+    rows = run.rows()
+    evaluations = [row for row in rows if row["kind"] == "eval"]
+    selections = [row for row in rows if row["kind"] == "select"]
+    recent = [
+        (f"{row['step']:,}", f"{row['mean']:.1f}", f"{row['std']:.1f}", len(row["returns"]))
+        for row in evaluations[-SHOWN_EVALUATIONS:]
+    ]
+    last = rows[-1] if rows else {}
+    ledger = [
+        (key, last[key])
+        for key in ("member_steps", "selection_steps", "updates", "transitions", "episodes")
+        if key in last
+    ]
+    times = [(key, f"{last[key]:.0f}") for key in ("cpu_seconds", "wall_seconds") if key in last]
+    settings = [(key, value) for key, value in record["settings"].items()]
+    made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
+    made += [(name, number) for name, number in record["versions"].items()]
+    return [
+        f"{run.path}: {step:,} of {budget:,} steps, {_status(run, step, budget)}",
+        "",
+        *_table(recent, ("step", "return", "std", "episodes")),
+        "",
+        *_table([*ledger, ("selections", len(selections)), *times]),
+        "",
+        *_table(settings),
+        "",
+        *_table(made),
+    ]
+
+
+def _state(run: RunDirectory) -> tuple[int, int, str]:
+    settings, rows = run.settings(), run.rows()
+    budget = settings["steps"] * (settings["members"] if settings["count"] == "member" else 1)
+    means = [row["mean"] for row in rows if row["kind"] == "eval"]
+    return (rows[-1]["step"] if rows else 0), budget, f"{means[-1]:.1f}" if means else "-"
+
+
+def _status(run: RunDirectory, step: int, budget: int) -> str:
+    if run.in_use():
+        return "running"
+    if step >= budget:
+        return "finished"
+    limit = run.settings()["time"]
+    late = limit is not None and any(row["wall_seconds"] >= limit for row in run.rows()[-1:])
+    return "finished" if late else "stopped"
+
+
+def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:
+    text = tabulate(rows, headers=headers, tablefmt="plain", disable_numparse=True)
+    return text.split("\n") if text else []

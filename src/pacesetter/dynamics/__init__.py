@@ -1,0 +1,1 @@
+"""Learned models of a task, and the rewards that are known."""

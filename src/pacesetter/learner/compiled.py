@@ -1,0 +1,190 @@
+"""One learner compiled once and called for each of K members, whose states are a plain list.
+
+Members share a program, not a call: alone, one is quicker so than under `vmap`, and several that
+are called from threads of their own keep more of the cores busy than one product split over them.
+Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
+so a waiting member shifts nobody's stream and no state ever holds a key.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pacesetter.algorithms.contract import Algorithm, Array, State
+from pacesetter.ensemble.rules import Parents
+from pacesetter.envs import Environment
+from pacesetter.learner.backend import compiler_options
+from pacesetter.learner.normalizer import Statistics
+from pacesetter.learner.precision import bfloat16_products
+from pacesetter.policy import OBSERVATION_LIMIT, Floats, Policy, unstack
+from pacesetter.replay.buffer import Columns
+
+KEYS = 1024  # made in one call: in the update itself they would come before every product
+
+
+class Draw(IntEnum):
+    """What a key is for."""
+
+    INIT = 0
+    UPDATE = 1
+
+
+class Cycle(NamedTuple):
+    """What a cycle of one member gave."""
+
+    state: State
+    losses: Floats  # (losses,)
+    error: Array  # (U, B)
+    acting: Any  # what it acts with now
+
+
+class Population:
+    """The compiled functions of one algorithm: the same program for every member and seed."""
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        columns: Columns,
+        seed: int,
+        normalize: bool,
+        precision: str = "f32",
+    ) -> None:
+        self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
+        self.key = jax.random.key(seed)
+        self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
+        self._acting = jax.jit(algorithm.acting)
+        self._fold = jax.jit(self._fold_keys)
+        self._keys = lru_cache(maxsize=1024)(self._make_keys)
+        update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
+        self._update = jax.jit(update, donate_argnums=0, compiler_options=compiler_options())
+
+    def init(self, members: int, same: bool) -> list[State]:
+        """New states; `same` gives every member the same weights."""
+        return [self._init(self.key, 0 if same else member) for member in range(members)]
+
+    def acting(self, states: Sequence[State]) -> list[Any]:
+        """What each member acts with, as NumPy arrays that no later update touches."""
+        return [jax.tree.map(np.array, self._acting(state)) for state in states]
+
+    def update(
+        self,
+        state: State,
+        member: int,
+        cycle: int,
+        rows: Floats,
+        weight: Floats | None,
+        statistics: Statistics,
+        extra: dict[str, Any] | None = None,
+    ) -> Cycle:
+        """One cycle of a member on rows (U, B, width); the given state is used up.
+
+        `extra` are fields of the batch that are not in rows. Members may be called from threads.
+        """
+        key = self._keys(member, cycle // KEYS)[cycle % KEYS]
+        inputs = (rows, weight, statistics, extra or {})
+        state, losses, error, acting = self._update(state, *inputs, key)
+        return Cycle(state, np.asarray(losses), error, acting)  # NumPy waits for the result
+
+    def loss_names(
+        self, state: State, rows: Floats | None = None, extra: dict[str, Any] | None = None
+    ) -> list[str]:
+        """Names of the columns of losses, in order; of rows only the shape matters."""
+        if rows is None:
+            rows = np.zeros((self.algorithm.cycle, 1, self.columns.width), np.float32)
+        size = self.columns.observation
+        statistics = (np.zeros(size), np.ones(size))
+
+        def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
+            batch = self._batch(rows, None, statistics)._replace(**extra)
+            return self.algorithm.update(state, batch, self.key).losses
+
+        return sorted(jax.eval_shape(losses, state, rows, extra or {}))
+
+    def policy(self, state: State, env: Environment, statistics: Statistics) -> Policy:
+        """What acts without noise in an env like this one, in NumPy alone."""
+        actors = self.algorithm.policy(state)
+        scale = statistics if self.normalize else None
+        layers = unstack(actors)
+        return Policy(
+            layers, actors.activation, actors.output, env.low, env.high, scale,
+            shapes=(env.observation_shape, env.action_shape),
+        )  # fmt: skip
+
+    def _make_keys(self, member: int, block: int) -> Any:
+        first = np.uint32(block * KEYS)
+        return np.asarray(self._fold(self.key, first, member))
+
+    # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
+
+    def _fold_keys(self, key: Array, first: Any, member: Any) -> Array:
+        cycles = first + jnp.arange(KEYS, dtype=jnp.uint32)
+        keys = jax.vmap(lambda cycle: _key(key, Draw.UPDATE, cycle, member))(cycles)
+        return jax.random.key_data(keys)
+
+    def _update_one(
+        self,
+        state: State,
+        rows: Array,
+        weight: Array | None,
+        statistics: Any,
+        extra: dict[str, Any],
+        key: Array,
+    ) -> tuple[State, Array, Array, Any]:
+        batch = self._batch(rows, weight, statistics)._replace(**extra)
+        whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
+        update = self.algorithm.update(state, batch, whole)
+        losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
+        # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
+        acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
+        return update.state, losses, update.error, acting
+
+    def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
+        batch = self.columns.unpack(rows, weight)
+        return batch._replace(
+            observation=self._scale(batch.observation, statistics),
+            next_observation=self._scale(batch.next_observation, statistics),
+        )
+
+    def _scale(self, observation: Array, statistics: Any) -> Array:
+        if not self.normalize:
+            return observation
+        mean, deviation = statistics
+        return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+def inherit(states: Sequence[Any], parents: Parents, copy: str) -> list[Any]:
+    """Each member's new state; who is its own parent goes on as it is. Of another parent, `full`
+    copies everything, `weights` leaves a member its own optimiser, and `actor` gives it only the
+    parent's actor, as its target too, with fresh Adam moments and the noise that fits it.
+    """
+    return [
+        own if parent == member else _descend(own, states[parent], copy)
+        for member, (own, parent) in enumerate(zip(states, parents, strict=True))
+    ]
+
+
+def _descend(own: Any, parent: Any, copy: str) -> Any:
+    if copy == "full":
+        new = parent
+    elif copy == "weights":
+        kept = [f for f in own._fields if f.endswith("_optimizer") or f == "updates"]
+        new = parent._replace(**{field: getattr(own, field) for field in kept})
+    else:
+        fresh = jax.tree.map(jnp.zeros_like, own.actor_optimizer)
+        new = own._replace(actor=parent.actor, actor_optimizer=fresh)
+        if "target_actor" in own._fields:
+            new = new._replace(target_actor=parent.actor)
+        if "sigma" in own._fields:
+            new = new._replace(sigma=parent.sigma)
+    return jax.tree.map(jnp.copy, new)  # updates use up their state, so no two may share a buffer
+
+
+def _key(key: Array, draw: Draw, cycle: Any, member: Any) -> Array:
+    for number in (int(draw), cycle, member):
+        key = jax.random.fold_in(key, number)
+    return key

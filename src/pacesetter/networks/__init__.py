@@ -1,0 +1,1 @@
+"""Networks as plain pytrees: layers, normalisation, critic heads, policies, exploration."""

@@ -1,0 +1,91 @@
+"""A Gaussian policy, and how far a step may take it (Schulman et al. 2015, appendix C)."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pacesetter.algorithms.contract import Array
+from pacesetter.networks import mlp
+
+
+class Gaussian(NamedTuple):
+    """A policy: a tanh network of the mean (A,), and a log deviation (A,) that sees nothing."""
+
+    network: mlp.Network
+    log_std: Array
+
+
+# A diagonal Gaussian: its mean (B, A) and log deviation (A,).
+Moments = tuple[Array, Array]
+
+
+def moments(actor: Gaussian, observation: Array) -> Moments:
+    return mlp.apply(actor.network, observation, jnp.tanh), actor.log_std
+
+
+def log_probability(moments: Moments, action: Array) -> Array:
+    """log pi (B,) of actions (B, A), which are not cut."""
+    mean, log_std = moments
+    distance = (action - mean) * jnp.exp(-log_std)
+    return -(0.5 * distance**2 + log_std + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=-1)
+
+
+def kl(old: Moments, new: Moments) -> Array:
+    """Mean over B of KL(old || new)."""
+    (old_mean, old_log_std), (mean, log_std) = old, new
+    squares = jnp.exp(2 * old_log_std) + (old_mean - mean) ** 2
+    each = log_std - old_log_std + 0.5 * squares * jnp.exp(-2 * log_std) - 0.5
+    return each.sum(axis=-1).mean()
+
+
+def fisher_product(
+    distribution: Callable[[Array], Moments], parameters: Array
+) -> Callable[[Array], Array]:
+    """v -> Fv, where F is the Hessian of the mean KL from `parameters` to themselves.
+
+    F = J'MJ exactly, with J the Jacobian of mean and log deviation, and M the Fisher matrix of a
+    Gaussian in those, which is diagonal: 1 / std^2 and 2.
+    """
+    (mean, log_std), jacobian = jax.linearize(distribution, parameters)
+    transposed = jax.linear_transpose(jacobian, parameters)
+
+    def product(vector: Array) -> Array:
+        mean_change, log_std_change = jacobian(vector)
+        weighted = mean_change * jnp.exp(-2 * log_std) / len(mean)
+        return transposed((weighted, 2 * log_std_change))[0]
+
+    return product
+
+
+def line_search(
+    judge: Callable[[Array], tuple[Array, Array]],
+    start: Array,
+    step: Array,
+    ratio: float,
+    tries: int,
+) -> tuple[Array, Array, Array]:
+    """The first of start + ratio^j * step that `judge` takes, whether any was, and its measures.
+
+    If none of j < tries is taken: start, False and zeros.
+    """
+
+    def goes_on(carry: Any) -> Array:
+        j, _, accepted, _ = carry
+        return ~accepted & (j < tries)
+
+    def attempt(carry: Any) -> Any:
+        j, *_ = carry
+        candidate = start + ratio**j * step
+        return j + 1, candidate, *judge(candidate)
+
+    _, measures = jax.eval_shape(judge, start)
+    nothing = jnp.zeros(measures.shape, measures.dtype)
+    begin = (jnp.zeros((), jnp.int32), start, jnp.array(False), nothing)
+    _, candidate, accepted, measures = jax.lax.while_loop(goes_on, attempt, begin)
+    return (
+        jnp.where(accepted, candidate, start),
+        accepted,
+        jnp.where(accepted, measures, nothing),
+    )

@@ -1,0 +1,1 @@
+"""The replay: its ring of rows, rows over several steps, and how rows are sampled."""

@@ -1,0 +1,224 @@
+"""The replay: one ring of packed float32 rows in a memory-mapped file.
+
+The file holds a little more than the logical window (SLACK), so rows written after a checkpoint
+never overwrite what that checkpoint, or the one before it, still needs.
+"""
+
+import mmap
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from pacesetter.algorithms.contract import Array, Batch
+from pacesetter.errors import UsageError
+from pacesetter.policy import Floats
+from pacesetter.replay.sampler import Drawing, Numbers, Uniform
+from pacesetter.storage import Arrays, digest
+
+BLOCK = 4096  # rows hashed together
+UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
+MEMBERS = 1_000  # at most, each of which may add n_step rows before the next checkpoint
+SLACK = 2 * (UNCOMMITTED + MEMBERS) + BLOCK
+
+
+class Columns(NamedTuple):
+    """Where each part of a transition stands in a row."""
+
+    observation: int
+    action: int
+    masks: int = 0
+
+    @property
+    def width(self) -> int:
+        return 2 * self.observation + self.action + 3 + self.masks
+
+    def pack(
+        self,
+        observation: Floats,
+        action: Floats,
+        reward: float,
+        following: Floats,
+        discount: float,
+        last: bool,
+        mask: Floats,
+    ) -> Floats:
+        """The row (width,) of a transition; `following` is what step() returned, never a reset
+        observation."""
+        parts = (observation, action, [reward], following, [discount, last], mask)
+        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+
+    def unpack(self, rows: Array, weight: Array | None) -> Batch:
+        """Rows (..., width) as a batch; without weights all count 1."""
+        ends = np.cumsum([self.observation, self.action, 1, self.observation, 1, 1])
+        observation, action, reward, following, discount, last, mask = jnp.split(
+            rows, ends, axis=-1
+        )
+        return Batch(
+            observation,
+            action,
+            reward[..., 0],
+            following,
+            discount[..., 0],
+            last[..., 0],
+            weight=jnp.ones(rows.shape[:-1]) if weight is None else weight,
+            mask=mask,
+        )
+
+
+class Sample(NamedTuple):
+    """Drawn rows (..., width), their numbers and their importance (None: all 1)."""
+
+    rows: Floats
+    numbers: Numbers
+    weight: Floats | None
+
+
+class Replay:
+    """A ring of the last `capacity` transitions; row n of the run lies in slot n % slots."""
+
+    def __init__(
+        self,
+        path: Path,
+        columns: Columns,
+        capacity: int,
+        budget: int,
+        drawing: Drawing | None = None,
+        tick: int | None = None,
+    ) -> None:
+        """`tick` is how many rows a tick adds at most."""
+        self.tick = MEMBERS if tick is None else tick
+        self.path, self.columns, self.capacity = path, columns, capacity
+        self.drawing = drawing or Uniform()
+        self.slots = capacity + SLACK
+        self.head = 0  # rows added so far
+        self.committed = 0  # rows that the latest checkpoint covers
+        self.hashes: list[str] = []  # of each complete block since the first row
+        self._map = _map_file(path, min(self.slots, budget) * columns.width * 4)
+        count = len(self._map) // (4 * columns.width)
+        flat = np.frombuffer(self._map, np.float32, count * columns.width)
+        self.rows: Floats = flat.reshape(count, columns.width)
+
+    def __len__(self) -> int:
+        return min(self.head, self.capacity)
+
+    @property
+    def window(self) -> range:
+        """The numbers of the rows that can be drawn."""
+        return range(self.head - len(self), self.head)
+
+    @property
+    def must_commit(self) -> bool:
+        """Whether more rows would eat into what the checkpoint before the latest needs."""
+        return self.head - self.committed + self.tick >= UNCOMMITTED + MEMBERS
+
+    def add(
+        self,
+        observation: Floats,
+        action: Floats,
+        reward: float,
+        following: Floats,
+        discount: float,
+        last: bool,
+        mask: Floats,
+        earned: float = 0.0,
+        member: int = 0,
+    ) -> None:
+        """Store one transition; `following` is what step() returned, never a reset observation.
+
+        `earned` is what the member's episode had returned before it.
+        """
+        row = self.columns.pack(observation, action, reward, following, discount, last, mask)
+        self.append(row, earned, member)
+
+    def append(self, row: Floats, earned: float = 0.0, member: int = 0) -> None:
+        """Store one transition that is packed already."""
+        self.rows[self.head % self.slots] = row
+        self.drawing.add(self.head, member, earned)
+        self.head += 1
+
+    def padded(self, size: int) -> Floats:
+        """The window as rows (size, width): row n of the run at n % size, zeros where none is."""
+        rows = np.zeros((size, self.columns.width), np.float32)
+        numbers = np.array(self.window[-size:])
+        rows[numbers % size] = self.rows[numbers % self.slots]
+        return rows
+
+    def sample(self, rng: np.random.Generator, shape: tuple[int, ...], done: float = 0.0) -> Sample:
+        """Rows drawn from the window; `done` is the share of the horizon that has passed."""
+        numbers, weight = self.drawing.draw(rng, shape, self.window, done)
+        return Sample(self.rows.take(numbers % self.slots, axis=0), numbers, weight)
+
+    def feedback(self, numbers: Numbers, error: Floats) -> None:
+        """The errors that an update found in drawn rows, before any further row is added."""
+        self.drawing.feedback(numbers, error)
+
+    def arrays(self) -> Arrays:
+        """What a checkpoint must hold besides the rows."""
+        return self.drawing.arrays(self.window)
+
+    def commit(self) -> dict[str, Any]:
+        """Put all rows on disk; what a checkpoint must know to find and verify them again."""
+        page = mmap.ALLOCATIONGRANULARITY
+        for start, stop in self._spans(self.committed, self.head):
+            first, end = (row * self.columns.width * 4 for row in (start, stop))
+            first -= first % page
+            self._map.flush(first, min(end - first, len(self._map) - first))
+        for block in range(len(self.hashes), self.head // BLOCK):
+            self.hashes.append(self._hash(block * BLOCK, (block + 1) * BLOCK))
+        self.committed = self.head
+        tail = self._hash(self.head // BLOCK * BLOCK, self.head)
+        first = self._first_block()
+        return {"head": self.head, "blocks": [first, *self.hashes[first:]], "tail": tail}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays | None = None) -> None:
+        """Take up the ring where a checkpoint left it, or refuse rows that are not its own."""
+        self.head = self.committed = int(table["head"])
+        first, *hashes = table["blocks"]
+        self.hashes = [""] * first + hashes
+        for block in range(self._first_block(), len(self.hashes)):
+            if self._hash(block * BLOCK, (block + 1) * BLOCK) != self.hashes[block]:
+                raise UsageError(f"{self.path}: damaged: rows from {block * BLOCK} on differ")
+        if self._hash(self.head // BLOCK * BLOCK, self.head) != table["tail"]:
+            raise UsageError(f"{self.path}: damaged: its newest rows differ")
+        self.drawing.restore(arrays or {}, self.window)
+
+    def close(self) -> None:
+        """Let go of the file, which is unmapped with its last user."""
+        del self.rows, self._map
+
+    def _first_block(self) -> int:
+        return self.window.start // BLOCK
+
+    def _spans(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """The slots of rows start..stop, in one span or, around the end of the file, two."""
+        if start == stop:
+            return []
+        first, last = start % self.slots, (stop - 1) % self.slots + 1
+        return [(first, last)] if first < last else [(first, self.slots), (0, last)]
+
+    def _hash(self, start: int, stop: int) -> str:
+        spans = self._spans(start, stop)
+        return digest(np.concatenate([self.rows[a:b] for a, b in spans])) if spans else ""
+
+
+def _map_file(path: Path, size: int) -> mmap.mmap:
+    try:
+        path.parent.mkdir(exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be opened: {error.strerror}") from None
+    try:
+        size = max(size, os.fstat(file).st_size)
+        # Without real blocks behind it, a full disk would kill the process at a later write.
+        os.posix_fallocate(file, 0, size)
+        return mmap.mmap(file, size)
+    except (OSError, OverflowError) as error:
+        raise UsageError(
+            f"{path}: cannot reserve {size / 1e6:.0f} MB for the replay: {error}; "
+            "free space or lower --replay-size"
+        ) from None
+    finally:
+        os.close(file)

@@ -1,0 +1,102 @@
+"""Rows drawn by the return of their episode, or by the return from them on."""
+
+from collections import deque
+
+import numpy as np
+
+from pacesetter.policy import Floats
+from pacesetter.replay.sampler import Drawn, Numbers, Reals, Shape, weigh
+from pacesetter.storage import Arrays
+
+FLOOR = 0.05  # added to a rank, so that no row is lost
+MIDDLE = 0.5  # rank of what has none yet
+REFERENCE = 4096  # rows that returns-to-go are ranked among
+
+
+class ByReturn:
+    """Rows of well-paid episodes more often: the future work of the Multi-TD3 paper.
+
+    An episode's rank u in (0, 1) is that of its return among the finished episodes in the window,
+    ties in their middle; its rows have priority (0.05 + u) ** exponent, those of running episodes
+    as in the middle. With `to_go` each row has its own rank, by the undiscounted return from it to
+    the episode's end. Ranks know neither scale nor sign of returns. Priorities are bounded, so
+    rows are drawn uniformly and kept in proportion: exact, and what left the window needs no care.
+    """
+
+    def __init__(self, size: int, exponent: float, importance: float, to_go: bool) -> None:
+        self.size, self.exponent, self.importance, self.to_go = size, exponent, importance, to_go
+        self.scores: Reals = np.full(size, np.nan)  # what rows are ranked by, once it is known
+        self.running: dict[int, list[tuple[int, float]]] = {}  # rows and what was earned before
+        self.ended: deque[tuple[float, int]] = deque()  # returns and last rows of episodes
+        self.ranking: Reals = np.zeros(0)  # sorted scores
+        self.head = 0
+
+    def add(self, number: int, member: int, earned: float) -> None:
+        self.scores[number % self.size] = np.nan
+        self.running.setdefault(member, []).append((number, earned))
+        self.head = number + 1
+
+    def end(self, member: int, total: float | None) -> None:
+        rows = [row for row in self.running.pop(member, []) if row[0] >= self.head - self.size]
+        if total is None or not rows:
+            return
+        for number, earned in rows:
+            self.scores[number % self.size] = total - earned if self.to_go else total
+        self.ended.append((total, rows[-1][0]))
+        gone: list[float] = []
+        while self.ended[0][1] < self.head - self.size:
+            gone.append(self.ended.popleft()[0])
+        if self.to_go:
+            self.ranking = np.sort(self._sampled())
+        else:  # kept sorted: sorting all anew would cost more with every short episode
+            left = np.delete(self.ranking, [self.ranking.searchsorted(score) for score in gone])
+            self.ranking = np.insert(left, left.searchsorted(total), total)
+
+    def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
+        count = int(np.prod(shape))
+        found: Numbers = np.zeros(0, np.int64)
+        priorities: Reals = np.zeros(0)
+        while len(found) < count:
+            numbers = window.start + rng.integers(len(window), size=2 * count)
+            priority = self.priority(numbers)
+            kept = rng.random(2 * count) < priority
+            found = np.concatenate([found, numbers[kept]])
+            priorities = np.concatenate([priorities, priority[kept]])
+        weight = weigh(priorities[:count].reshape(shape), self.importance, done)
+        return Drawn(found[:count].reshape(shape), weight)
+
+    def priority(self, numbers: Numbers) -> Reals:
+        """Priorities of rows, as shares of the largest that there can be."""
+        scores = self.scores[numbers % self.size]
+        below, above = (self.ranking.searchsorted(scores, side) for side in ("left", "right"))
+        rank = (below + above) / max(2 * len(self.ranking), 1)
+        rank = np.where(np.isnan(scores), MIDDLE, rank)
+        return ((FLOOR + rank) / (FLOOR + 1)) ** self.exponent
+
+    def feedback(self, numbers: Numbers, error: Floats) -> None: ...
+
+    def arrays(self, window: range) -> Arrays:
+        rows = [(member, *row) for member, rows in self.running.items() for row in rows]
+        return {
+            "scores": self.scores[: len(window)],
+            "ranking": self.ranking,
+            "ended": np.array(self.ended, np.float64).reshape(-1, 2),
+            "running": np.array(rows, np.float64).reshape(-1, 3),
+        }
+
+    def restore(self, arrays: Arrays, window: range) -> None:
+        self.size = max(self.size, len(window))
+        self.scores = np.full(self.size, np.nan)
+        self.scores[: len(window)] = arrays["scores"]
+        self.ranking = arrays["ranking"]
+        self.ended = deque((float(total), int(last)) for total, last in arrays["ended"])
+        self.running = {}
+        for member, number, earned in arrays["running"]:
+            self.running.setdefault(int(member), []).append((int(number), float(earned)))
+        self.head = window.stop
+
+    def _sampled(self) -> Reals:
+        """Scores of evenly spaced rows, which are sorted quickly."""
+        filled = min(self.head, self.size)
+        scores = self.scores[: filled : -(-filled // REFERENCE)]
+        return scores[~np.isnan(scores)]

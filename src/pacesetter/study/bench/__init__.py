@@ -1,0 +1,1 @@
+"""Many runs: suites, their queue, and where they run."""

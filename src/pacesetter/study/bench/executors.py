@@ -1,0 +1,167 @@
+"""Where the commands of a bench run: on this machine's cores, on a Ray cluster, or on paper."""
+
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pacesetter.errors import UsageError
+from pacesetter.study.bench.queue import ALONE, Outcome
+from pacesetter.study.bench.suite import Job
+
+
+def cores() -> list[int]:
+    """Cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))
+
+
+class Local:
+    """Processes on this machine, each pinned to a core, which is what two cores do most with."""
+
+    def __init__(self, slots: int) -> None:
+        self.slots, self._cores = slots, cores()
+
+    def start(self, slot: int, words: list[str]) -> Any:
+        output = tempfile.TemporaryFile()  # noqa: SIM115, as `poll` closes it
+        with _pinned(self._cores[slot % len(self._cores)]):
+            return _popen(words, output), output
+
+    def poll(self, task: Any) -> Outcome | None:
+        process, output = task
+        if process.poll() is None:
+            return None
+        output.seek(0)
+        with output:
+            return Outcome(process.returncode, output.read().decode(errors="replace"))
+
+    def stop(self, task: Any) -> None:
+        task[0].terminate()
+
+
+class Ray:
+    """Tasks of a Ray cluster; each only runs a command, in this folder, which all nodes share."""
+
+    def __init__(self, slots: int | None, address: str | None) -> None:
+        try:
+            ray: Any = import_module(
+                "ray"
+            )  # an extra that may be absent, also where types are checked
+        except ImportError:
+            raise UsageError(
+                "executor: ray is not installed; pip install 'pacesetter[scale]'"
+            ) from None
+        self._ray = ray
+        try:
+            ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise UsageError(f"address: no Ray cluster at {address}: {error}") from None
+        self.slots = slots or max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        self._run: Any = ray.remote(num_cpus=1, max_retries=0)(run_command)
+
+    def start(self, slot: int, words: list[str]) -> Any:
+        return self._run.remote(words, os.getcwd())
+
+    def poll(self, task: Any) -> Outcome | None:
+        if not self._ray.wait([task], timeout=0)[0]:
+            return None
+        try:
+            return Outcome(*self._ray.get(task))
+        except self._ray.exceptions.TaskCancelledError:
+            return Outcome(143, "")
+        except self._ray.exceptions.RayError as error:  # its worker or its node is lost
+            return Outcome(1, str(error))
+
+    def stop(self, task: Any) -> None:
+        self._ray.cancel(task)
+
+
+def run_command(words: list[str], folder: str) -> tuple[int, str]:
+    """`pacesetter WORDS` in a folder; interrupted, as Ray cancels a task, it saves and ends."""
+    # A cluster that was started in the background of a script ignores interrupts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with tempfile.TemporaryFile() as output:
+        process = _popen(words, output, folder)
+        try:
+            while process.poll() is None:  # Ray cannot interrupt a wait
+                time.sleep(0.2)
+        except KeyboardInterrupt:
+            process.terminate()
+            process.wait()
+        output.seek(0)
+        return process.returncode, output.read().decode(errors="replace")
+
+
+def _popen(words: list[str], output: Any, folder: str | None = None) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "pacesetter", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env=os.environ | ALONE,
+        cwd=folder,
+        start_new_session=True,  # Ctrl-C reaches the bench alone, which passes it on once
+    )
+
+
+@contextmanager
+def _pinned(core: int) -> Generator[None]:
+    """What is started in here runs on one core for good, and from its first instruction."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+# On paper.
+
+
+def commands(jobs: Iterable[Job]) -> list[str]:
+    """A line of shell a run, which begins or resumes it, whichever is due when it is called."""
+    alone = " ".join(f"{name}={value}" for name, value in ALONE.items())
+    program = f"{alone} exec {shlex.quote(sys.executable)} -m pacesetter"
+    lines: list[str] = []
+    for job in jobs:
+        path = shlex.quote(str(job.directory.path))
+        config = shlex.quote(str(job.directory.config_file))
+        train = shlex.join(job.words)
+        lines.append(
+            f"if [ -e {config} ]; then {program} resume {path} -q; else {program} {train} -q; fi"
+        )
+    return lines
+
+
+SLURM = """\
+#!/bin/bash
+#SBATCH --job-name={name}
+#SBATCH --array=0-{last}
+#SBATCH --cpus-per-task=1
+#SBATCH --requeue
+#SBATCH --signal=TERM@120
+#SBATCH --open-mode=append
+# sbatch --time=... --mem=... this file, in the folder where it was made; and again after a failure.
+commands=(
+{commands}
+)
+srun bash -c "${{commands[$SLURM_ARRAY_TASK_ID]}}"
+code=$?
+case $code in
+130 | 143) scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" ;; # saved: go on
+esac
+exit $code
+"""
+
+
+def slurm(name: str, jobs: list[Job]) -> str:
+    """A job array, a task a run; Slurm's notice before the time limit makes a run save."""
+    lines = "\n".join(shlex.quote(line) for line in commands(jobs))
+    return SLURM.format(name=Path(name).stem, last=len(jobs) - 1, commands=lines)

@@ -1,0 +1,196 @@
+"""Jobs to their end: each run a command of its own; finished ones are skipped, broken ones resumed.
+
+What has been done is read from the runs' folders alone, so a bench that was stopped or killed is
+called again, and several may work on one folder: the lock of a run's folder decides who has it.
+"""
+
+import shlex
+import time
+from collections import Counter, deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol
+
+from pacesetter import storage
+from pacesetter.ensemble.progress import Progress
+from pacesetter.errors import UsageError
+from pacesetter.runs import IN_USE
+from pacesetter.study.bench.suite import Job
+
+RETRIES = 2
+BAD_INPUT, SAVED = 2, (130, 143)  # exit codes of `train` and `resume`
+POLL = 0.2  # seconds
+ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread a run: results never depend on --jobs
+
+
+class Outcome(NamedTuple):
+    """How a command ended: its exit code, minus the signal if killed, and all that it printed."""
+
+    code: int
+    output: str
+
+
+class Executor(Protocol):
+    """Where commands run; a task is whatever `start` gives."""
+
+    slots: int
+
+    def start(self, slot: int, words: list[str]) -> Any:
+        """Begin `pacesetter WORDS`."""
+        ...
+
+    def poll(self, task: Any) -> Outcome | None:
+        """How it ended, None while it runs."""
+        ...
+
+    def stop(self, task: Any) -> None:
+        """Ask it to save and end."""
+        ...
+
+
+def refuse_others(job: Job) -> None:
+    """Refuse a run that is in the job's folder with other settings."""
+    if not job.directory.config_file.exists():
+        return
+    old, new = job.directory.config().settings(), job.config.settings()
+    for key in new:
+        if old.get(key) != new[key]:
+            raise UsageError(
+                f"run: {job.directory.path} exists with {key}={old.get(key)}, not {new[key]}; "
+                "give other --runs, or the entry another name"
+            )
+
+
+def is_finished(job: Job) -> bool:
+    """Whether the newest checkpoint has spent the job's budget and been evaluated there."""
+    try:
+        table = storage.read(job.directory.state_file, "checkpoint").table
+        progress = Progress.load(table["progress"])
+    except (UsageError, *storage.FAULTS):
+        return False  # nothing yet, or damaged, which `resume` deals with
+    run = job.config.run
+    spent = progress.step >= run.steps * job.config.unit
+    late = run.time is not None and progress.wall_seconds >= run.time
+    return (spent or late) and progress.last_evaluation == progress.step
+
+
+def words_of(job: Job) -> list[str]:
+    """What brings a run further: `resume` if its folder holds one, else `train`."""
+    if job.directory.config_file.exists():
+        return ["resume", str(job.directory.path), "-q"]
+    return [*job.words, "-q"]
+
+
+class Bench:
+    """All jobs and where they are; refuses a folder that holds another run."""
+
+    def __init__(self, jobs: list[Job]) -> None:
+        for job in jobs:
+            refuse_others(job)
+        self.jobs = jobs
+        done = [is_finished(job) for job in jobs]
+        self.finished = [job for job, over in zip(jobs, done, strict=True) if over]
+        self.before = len(self.finished)
+        self.failed: dict[str, str] = {}
+        self.running: dict[int, tuple[Job, Any, list[str]]] = {}
+        self.news: list[str] = []
+        self._waiting = deque(job for job, over in zip(jobs, done, strict=True) if not over)
+        self._failures: Counter[str] = Counter()
+        self._aside: set[str] = set()
+        self._stopping = False
+
+    def stop(self) -> None:
+        """Ask for the end once the running jobs have saved; may be called from a handler."""
+        self._stopping = True
+
+    def check_envs(self) -> None:
+        """Refuse a task that cannot be made, before anything starts."""
+        from pacesetter.envs import make
+
+        tasks = {(job.config.run.env, str(job.config.run.env_kwargs)): job for job in self.left}
+        for job in tasks.values():
+            make(job.config.run.env, job.config.run.env_kwargs).close()
+
+    def run(self, executor: Executor) -> Iterator[None]:
+        """Until all have finished or failed, or have saved after `stop`; yields at every look."""
+        stopped = False
+        try:
+            while self._waiting or self.running:
+                if self._stopping and not stopped:
+                    stopped = True
+                    self._waiting.clear()
+                    self._stop_all(executor)
+                self._poll(executor, stopped)
+                self._start(executor)
+                yield
+                time.sleep(POLL)
+        finally:
+            self._stop_all(executor)
+
+    def _stop_all(self, executor: Executor) -> None:
+        for _, task, _ in self.running.values():
+            executor.stop(task)
+
+    @property
+    def left(self) -> list[Job]:
+        """Jobs that neither run nor have ended; some may be in use by another process."""
+        return list(self._waiting)
+
+    def _start(self, executor: Executor) -> None:
+        for slot in set(range(executor.slots)) - self.running.keys():
+            for _ in range(len(self._waiting)):
+                job = self._waiting.popleft()
+                if job.directory.in_use():  # by another bench, or left by one that was killed
+                    self._set_aside(job)
+                elif is_finished(job):
+                    self._finish(job)
+                else:
+                    words = words_of(job)
+                    self.running[slot] = job, executor.start(slot, words), words
+                    self.news.append(f"{job}: {words[0]}")
+                    break
+
+    def _poll(self, executor: Executor, stopped: bool) -> None:
+        for slot, (job, task, words) in list(self.running.items()):
+            outcome = executor.poll(task)
+            if outcome is not None:
+                del self.running[slot]
+                self._end(job, words, outcome, stopped)
+
+    def _end(self, job: Job, words: list[str], outcome: Outcome, stopped: bool) -> None:
+        overtaken = words[0] == "train" and job.directory.config_file.exists()
+        if is_finished(job):
+            self._finish(job)
+        elif stopped:
+            self.news.append(f"{job}: stopped")
+        elif outcome.code in SAVED:
+            self._waiting.append(job)
+        elif outcome.code == BAD_INPUT and (IN_USE in outcome.output or overtaken):
+            self._set_aside(job)
+        elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
+            self._fail(job, words, outcome)
+        else:
+            self._failures[str(job)] += 1
+            self._waiting.append(job)
+            self.news.append(f"{job}: failed, {_last_line(outcome)}; trying again")
+
+    def _set_aside(self, job: Job) -> None:
+        self._waiting.append(job)
+        if str(job) not in self._aside:
+            self._aside.add(str(job))
+            self.news.append(f"{job}: another process has it; looked at again when it is free")
+
+    def _finish(self, job: Job) -> None:
+        self.finished.append(job)
+        self.news.append(f"{job}: finished")
+
+    def _fail(self, job: Job, words: list[str], outcome: Outcome) -> None:
+        folder = job.directory.path
+        if folder.is_dir():
+            (folder / "failure.log").write_text(f"$ {shlex.join(words)}\n{outcome.output}")
+        self.failed[str(job)] = _last_line(outcome)
+        self.news.append(f"{job}: failed for good, {_last_line(outcome)}")
+
+
+def _last_line(outcome: Outcome) -> str:
+    *_, last = ["", *(line for line in outcome.output.splitlines() if line.strip())]
+    return f"exit {outcome.code}: {last.removeprefix('pacesetter: ')}".rstrip(": ")

@@ -1,0 +1,236 @@
+"""A run as its results: what is read from a run directory, or from a line of results/*.jsonl."""
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pacesetter.errors import UsageError
+from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all
+from pacesetter.study.compare import stats
+from pacesetter.study.compare.stats import Array
+
+COLUMNS = ("step", "returns", "updates", "transitions", "cpu_seconds", "wall_seconds")
+AXES = {
+    "steps": "env steps, all members",
+    "updates": "gradient updates",
+    "cpu": "CPU seconds",
+    "wall": "wall-clock seconds",
+}
+PROVENANCE = ("command", "versions", "commit", "threads", "machine")
+SELECTION = ("step", "gap", "standard_error", "parents", "champion")
+DECIMALS = 3  # of a return in a line of results
+# Numbers of an evaluation's row that are no expense; what else is there, an algorithm counts.
+_NOT_SPENT = {"mean", "std", "champion", "episodes", *COLUMNS}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Evaluations of a run: arrays (N,), cut at a budget; `returns` are means over episodes.
+
+    `extra` is what only some algorithms count, such as steps in a model.
+    """
+
+    source: str
+    table: Row
+    steps: Array
+    returns: Array
+    updates: Array
+    transitions: Array
+    cpu: Array
+    wall: Array
+    extra: dict[str, Array]
+    folder: Path | None = None
+
+    @property
+    def settings(self) -> Row:
+        return self.table["settings"]
+
+    @property
+    def env(self) -> str:
+        """The task: env id with version, and keywords if there are any."""
+        kwargs = self.settings.get("env_kwargs") or {}
+        return " ".join([self.settings["env"], *(f"{k}={v}" for k, v in kwargs.items())])
+
+    @property
+    def name(self) -> str:
+        return self.settings["name"]
+
+    @property
+    def seed(self) -> int:
+        return self.settings["seed"]
+
+    @cached_property
+    def clock(self) -> Array:
+        """Steps at which the evaluations were due (N,); they come at the next tick's end."""
+        every = self.settings["eval_every"] * self._unit
+        due = self.steps // every * every
+        again = np.diff(due, prepend=-1) == 0  # the one at the end of an odd budget
+        ended = self.steps >= self.planned
+        return np.where(ended, self.planned, np.where(again, self.steps, due))
+
+    @property
+    def _unit(self) -> int:
+        return self.settings["members"] if self.settings["count"] == "member" else 1
+
+    @property
+    def planned(self) -> int:
+        """Env steps the run was to make."""
+        return self.settings["steps"] * self._unit
+
+    @property
+    def budget(self) -> int:
+        """Env steps up to which the run counts, by its plan or its time limit."""
+        return min(self.planned, int(self.clock[-1]))
+
+    @property
+    def finished(self) -> bool:
+        limit = self.settings.get("time")
+        return self.clock[-1] >= self.planned or (limit is not None and self.wall[-1] >= limit)
+
+    def cut(self, budget: int) -> "Run":
+        """The run as it was at a budget."""
+        kept = self.clock <= budget
+        names = ("steps", "returns", "updates", "transitions", "cpu", "wall")
+        cut: dict[str, Any] = {name: getattr(self, name)[kept] for name in names}
+        cut["extra"] = {name: values[kept] for name, values in self.extra.items()}
+        settings = self.settings | {"steps": min(budget, self.planned) // self._unit}
+        return replace(self, **cut, table=self.table | {"settings": settings})
+
+    def within(self, cpu: float) -> "Run":
+        """The run as it was when it had spent so many CPU seconds."""
+        return self.cut(int(self.clock[self.cpu <= cpu].max(initial=0)))
+
+    def metric(self, name: str) -> float:
+        """`final`, `auc` or `max`; the last is over evaluations after the first update."""
+        if name == "final":
+            return stats.final(self.clock, self.returns, self.budget)
+        if name == "auc":
+            return stats.area(self.steps, self.returns)
+        learned = self.returns[self.updates > 0]
+        return float(learned.max()) if learned.size else np.nan
+
+    def reached(self, level: float) -> float:
+        """Env steps at which a policy that has learned at all first had a return of `level`."""
+        learned = self.updates > 0
+        return stats.reached(self.clock[learned], self.returns[learned], level)
+
+    @property
+    def selections(self) -> list[Any]:
+        """A row of SELECTION for each selection up to the cut."""
+        return [row for row in self.table.get("selections", []) if row[0] <= self.steps[-1]]
+
+
+def compact(run: RunDirectory) -> Row:
+    """A run as one line: config, versions, commit, evaluations with their ledger, selections."""
+    record, rows = run.record(), run.rows("eval", "select")
+    evaluations = [row for row in rows if row["kind"] == "eval"]
+    columns = [*COLUMNS, *_extra(evaluations)]
+    try:
+        return {
+            **record,
+            "columns": columns,
+            "evaluations": [[_short(row[column]) for column in columns] for row in evaluations],
+            "selections": [
+                [row[column] for column in SELECTION] for row in rows if row["kind"] == "select"
+            ],
+        }
+    except (KeyError, TypeError) as error:
+        raise UsageError(f"{run.metrics_file}: damaged: {error} is missing in a row") from None
+
+
+def _extra(evaluations: list[Row]) -> list[str]:
+    last = evaluations[-1] if evaluations else {}
+    counts = {key for key, value in last.items() if isinstance(value, (int, float)) and value}
+    return sorted(counts - _NOT_SPENT)
+
+
+def _short(value: Any) -> Any:
+    return [round(one, DECIMALS) for one in value] if isinstance(value, list) else value
+
+
+def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
+    """Check one line of results; None if the run has no evaluation yet."""
+    try:
+        missing = [key for key in PROVENANCE if key not in table]
+        if missing:
+            raise ValueError(f"no {', '.join(missing)}; a result without them is not compared")
+        if table["schema"] != SCHEMA:
+            raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
+        names = table["columns"][len(COLUMNS) :]
+        if table["columns"] != [*COLUMNS, *names]:
+            raise ValueError(f"columns must begin with {', '.join(COLUMNS)}")
+        if not table["evaluations"]:
+            return None
+        columns = list(zip(*table["evaluations"], strict=True))
+        columns[1] = tuple(sum(returns) / len(returns) for returns in columns[1])
+        arrays = [np.array(column, dtype=float) for column in columns]
+        extra = dict(zip(names, arrays[len(COLUMNS) :], strict=True))
+        run = Run(source, table, *arrays[: len(COLUMNS)], extra=extra, folder=folder)
+        if not np.isfinite(arrays).all():
+            raise ValueError("an evaluation is not finite")
+        hash((run.env, run.name, run.seed, run.budget))  # all there and of the right kind
+    except (ValueError, LookupError, TypeError, ZeroDivisionError) as error:
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise UsageError(f"{source}: damaged or foreign: {reason}") from None
+    return run
+
+
+def gather(words: Iterable[str | Path], runs: str | Path = "runs") -> tuple[list[Run], list[str]]:
+    """All runs that the words name, each once, and those that have no evaluation yet.
+
+    A word is a file of results, a run, a folder of runs, the tail of either, or a pattern.
+    """
+    found: dict[str, Run] = {}
+    empty: list[str] = []
+    for word in words:
+        for source, table, folder in _sources(str(word), Path(runs)):
+            key = str(Path(source).resolve())
+            if key in found:
+                continue
+            run = read(source, compact(RunDirectory(folder)) if folder else table, folder)
+            if run is None:
+                empty.append(source)
+            else:
+                found[key] = run
+    return list(found.values()), empty
+
+
+def _sources(word: str, runs: Path) -> Iterator[tuple[str, Any, Path | None]]:
+    if Path(word).is_file():
+        yield from _lines(Path(word))
+        return
+    for run in _directories(word, runs):
+        yield str(run.path), None, run.path
+
+
+def _directories(word: str, runs: Path) -> list[RunDirectory]:
+    if below := list(find_all(word) if Path(word).is_dir() else []):
+        return below
+    if any(mark in word for mark in "*?["):
+        below = [run for path in sorted(glob(word)) for run in find_all(path)]
+        below += [run for run in find_all(runs) if _fits(run.path, word)]
+        if not below:
+            raise UsageError(f"run: '{word}' fits no run here or below {runs}")
+        return below
+    groups = [run for run in find_all(runs) if run.path.parent.match(word)]
+    return groups or [find(word, runs)]
+
+
+def _fits(path: Path, pattern: str) -> bool:
+    return path.match(pattern) or path.parent.match(pattern)
+
+
+def _lines(path: Path) -> Iterator[tuple[str, Any, Path | None]]:
+    if path.suffix != ".jsonl":
+        raise UsageError(f"run: {path} is neither a run's folder nor a .jsonl file of results")
+    try:
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            yield f"{path}:{number}", json.loads(line), None
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{path}: damaged: {error}") from None

@@ -1,0 +1,156 @@
+"""What the tables of groups and of single runs hold."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pacesetter.study.compare import stats
+from pacesetter.study.compare.comparison import METRICS, Comparison, Group, split
+from pacesetter.study.compare.stats import FEWEST_SEEDS, Array, Interval
+from pacesetter.study.report.tables import Cell, Table, interval, number, spread, steps, word
+
+LEVELS = (1_000, 2_000)
+SPENT = {
+    "steps": "env steps",
+    "updates": "updates",
+    "transitions": "transitions",
+    "cpu": "CPU s",
+    "wall": "wall s",
+}
+INTERVAL = "[low; high] is the 95% interval of the mean by Student's t over seeds."
+
+
+def title(comparison: Comparison) -> str:
+    """What is compared, in a few words."""
+    names, envs = comparison.names, comparison.envs
+    tasks = ", ".join(envs) if len(envs) <= 4 else f"{len(envs)} tasks"
+    return f"{' and '.join(names) if len(names) <= 3 else f'{len(names)} algorithms'} on {tasks}"
+
+
+def ledger(groups: Sequence[Group], factor: int = 1) -> Table:
+    """What a mean run of each group has spent, times a factor."""
+    extra = list(dict.fromkeys(key for group in groups for key in group.spent if key not in SPENT))
+    rows = [
+        [word(group.env), word(group.name), number(len(group.runs))]
+        + [number(factor * group.spent.get(key, 0)) for key in (*SPENT, *extra)]
+        for group in groups
+    ]
+    shown = [*SPENT.values(), *(key.replace("_", " ") for key in extra)]
+    return Table("Ledger: spent by a mean run", ["env", "algorithm", "runs", *shown], rows)
+
+
+def overview(comparison: Comparison) -> Table:
+    """The metric, one row an algorithm and one column a task; each cell says version and seeds."""
+    metric = comparison.metric
+    rows: list[list[Cell]] = []
+    for name in comparison.names:
+        row = [word(name)]
+        for env in comparison.envs:
+            group = comparison.find(env, name)
+            found = stats.mean(group.values(metric)) if group else Interval(np.nan)
+            row.append(interval(found, after=f" ({about(group)})" if group else ""))
+        rows.append(row)
+    title = {"final": "Final return", "auc": "Mean return of training", "max": "Maximum return"}
+    notes = [f"{title[metric]}: {METRICS[metric]}. {INTERVAL}"]
+    return Table(
+        title[metric], ["algorithm", *comparison.envs], rows, notes, ledger(comparison.groups)
+    )
+
+
+def about(group: Group) -> str:
+    """The small print of a cell: env version, seeds, budget, and whether it is indicative."""
+    budget = " and ".join(steps(count) for count in group.budgets)
+    few = ", indicative" if len(group.runs) < FEWEST_SEEDS else ""
+    return f"{split(group.env)[1]}, n={len(group.runs)}, {budget}{few}"
+
+
+def details(comparison: Comparison) -> Table:
+    """Every metric of every group, and each seed."""
+    rows: list[list[Cell]] = []
+    for group in comparison.groups:
+        values = group.values("final")
+        rows.append(
+            [
+                word(group.env),
+                word(group.name),
+                number(len(group.runs)),
+                interval(stats.mean(values)),
+                number(stats.deviation(values)),
+                interval(stats.iqm([values])),
+                interval(stats.mean(group.values("auc"))),
+                interval(stats.mean(group.values("max"))),
+                word(" ".join(f"{value:.0f}" for value in values)),
+            ]
+        )
+    headers = ["env", "algorithm", "n", "final", "SD over seeds", "IQM", "area", "max (inflated)"]
+    notes = [
+        f"final: {METRICS['final']}. area: {METRICS['auc']}. max: {METRICS['max']}. {INTERVAL}",
+        "IQM: interquartile mean of final, with a BCa bootstrap interval from five seeds on.",
+    ]
+    rows = sorted(rows, key=lambda row: (row[0].text, -(row[3].key or 0)))
+    return Table(
+        "Each group",
+        [*headers, "final of each seed"],
+        rows,
+        notes,
+        ledger(comparison.groups),
+    )
+
+
+def speed(comparison: Comparison) -> Table:
+    """How soon rewards come, and what a step costs."""
+    rows: list[list[Cell]] = []
+    for group in comparison.groups:
+        row = [word(group.env), word(group.name), number(len(group.runs))]
+        row += [soon(group.reached(level)) for level in LEVELS]
+        cost = np.array([1_000 * run.cpu[-1] / run.steps[-1] for run in group.runs])
+        rate = np.array([run.steps[-1] / run.wall[-1] for run in group.runs])
+        rows.append([*row, interval(stats.mean(cost), 2), interval(stats.mean(rate))])
+    levels = [f"env steps to {level:,}" for level in LEVELS]
+    notes = [
+        "Env steps to a return: the first evaluation there, after the first update; median over "
+        "seeds and how many of them arrived, those that never do counting as last. Steps/s: of the "
+        "whole run by the clock on the wall, with its warm-up and evaluations."
+    ]
+    headers = ["env", "algorithm", "n", *levels, "CPU s per 1k steps", "env steps/s"]
+    return Table("Better rewards sooner", headers, rows, notes, ledger(comparison.groups))
+
+
+def soon(reached: Array) -> Cell:
+    middle = float(np.median(reached))
+    arrived = int(np.isfinite(reached).sum())
+    return Cell(f"{number(middle).text} ({arrived} of {len(reached)})", middle)
+
+
+def runs(comparison: Comparison) -> Table:
+    """Each run: its command and what made it."""
+    rows = [
+        [
+            word(run.env),
+            word(run.name),
+            number(run.seed),
+            number(run.budget),
+            spread(run.metric("final"), None),
+            word(run.table["command"]),
+            word((run.table["commit"] or "none")[:12] + _dirty(run.table["commit"])),
+            number(run.table["threads"]),
+            word(run.source),
+        ]
+        for run in comparison.runs
+    ]
+    headers = ["env", "algorithm", "seed", "steps", "final", "command", "commit", "threads", "from"]
+    return Table("Each run", headers, rows)
+
+
+def _dirty(commit: str | None) -> str:
+    return "-dirty" if commit and commit.endswith("-dirty") else ""
+
+
+def made_with(comparison: Comparison) -> list[str]:
+    """Versions and machines of the runs, one line each combination."""
+    lines = [
+        ", ".join(f"{name} {number}" for name, number in run.table["versions"].items())
+        + f"; {run.table['machine']}, {run.table['threads']} threads"
+        for run in comparison.runs
+    ]
+    return [f"{line} ({lines.count(line)} runs)" for line in dict.fromkeys(lines)]

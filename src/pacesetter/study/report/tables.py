@@ -1,0 +1,133 @@
+"""Tables as data, and as plain text, Markdown or LaTeX; each ends in its ledger and its notes."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from tabulate import LATEX_ESCAPE_RULES, tabulate
+
+from pacesetter.study.compare.stats import Interval
+
+
+class Cell(NamedTuple):
+    """What is shown, and the number it is sorted by."""
+
+    text: str
+    key: float | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Headers and rows; the ledger says what the runs in it have spent."""
+
+    title: str
+    headers: list[str]
+    rows: list[list[Cell]]
+    notes: list[str] = field(default_factory=list[str])
+    ledger: "Table | None" = None
+
+
+def word(text: object) -> Cell:
+    """A cell of words."""
+    return Cell(str(text))
+
+
+def number(value: float, digits: int = 0, unit: str = "") -> Cell:
+    """A cell of one number; `-` where there is none."""
+    if np.isnan(value):
+        return Cell("-")
+    if np.isinf(value):
+        return Cell("never", value)
+    return Cell(f"{value:,.{digits}f}{unit}", value)
+
+
+def interval(found: Interval, digits: int = 0, after: str = "") -> Cell:
+    """A cell of an estimate and its 95% interval, with words after it."""
+    if np.isnan(found.value):
+        return Cell("-")
+    text = f"{found.value:,.{digits}f}"
+    if not np.isnan(found.low):
+        text += f" [{found.low:,.{digits}f}; {found.high:,.{digits}f}]"
+    return Cell(text + after, found.value)
+
+
+def spread(value: float, deviation: float | None, after: str = "") -> Cell:
+    """A cell of a mean, its deviation if known, and words after it."""
+    known = deviation is not None and not np.isnan(deviation)
+    return Cell(f"{value:,.1f}{f' ± {deviation:,.1f}' if known else ''}{after}", value)
+
+
+def steps(count: float) -> str:
+    """Env steps as people write them: 5M, 300k, 1,234."""
+    for size, letter in ((1_000_000, "M"), (1_000, "k")):
+        if count >= size and count % (size / 10) == 0:
+            return f"{count / size:g}{letter}"
+    return f"{count:,.0f}"
+
+
+def grid(table: Table, form: str) -> str:
+    """Headers and rows alone, in one of tabulate's formats."""
+    rows = [[cell.text for cell in row] for row in table.rows]
+    return tabulate(rows, table.headers, tablefmt=form, disable_numparse=True)
+
+
+def plain(tables: Iterable[Table]) -> str:
+    """For a terminal."""
+    return "\n\n".join("\n".join(_plain(table)) for table in tables)
+
+
+def _plain(table: Table) -> list[str]:
+    lines = [table.title, "", grid(table, "plain")]
+    if table.ledger:
+        lines += ["", table.ledger.title, grid(table.ledger, "plain")]
+    return lines + ([""] if table.notes else []) + table.notes
+
+
+def markdown(title: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
+    """A page of Markdown."""
+    parts = [f"# {title}", *([_list(notes)] if notes else [])]
+    for table in tables:
+        parts += [f"## {table.title}", grid(table, "github")]
+        if table.ledger:
+            parts += [f"{table.ledger.title}:", grid(table.ledger, "github")]
+        if table.notes:
+            parts.append(_list(table.notes))
+    return "\n\n".join(parts) + "\n"
+
+
+def _list(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def latex(title: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
+    """Tables for `\\input`; needs booktabs and graphicx."""
+    parts = [f"% {title}. Needs \\usepackage{{booktabs,graphicx}}."]
+    parts += [f"% {line}" for line in notes]
+    for table in tables:
+        parts += ["\\begin{table}", "\\centering", f"\\caption{{{escape(table.title)}}}"]
+        parts.append(_fit(grid(table, "latex_booktabs")))
+        if table.ledger:
+            parts += ["", "\\smallskip", f"{escape(table.ledger.title)}", ""]
+            parts.append(_fit(grid(table.ledger, "latex_booktabs")))
+        parts += [f"\n\\footnotesize {escape(' '.join(table.notes))}"] if table.notes else []
+        parts.append("\\end{table}\n")
+    return "\n".join(parts)
+
+
+def _fit(tabular: str) -> str:
+    body = tabular.replace("±", "$\\pm$")
+    return (
+        f"\\resizebox{{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}}{{!}}{{%\n{body}}}"
+    )
+
+
+def count(value: float) -> Cell:
+    """A cell of a number of env steps."""
+    return Cell(steps(value), value)
+
+
+def escape(text: str) -> str:
+    """Words as LaTeX."""
+    escaped = "".join(LATEX_ESCAPE_RULES.get(letter, letter) for letter in text)
+    return escaped.replace("±", "$\\pm$")

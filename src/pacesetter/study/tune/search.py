@@ -1,0 +1,213 @@
+"""Search settings with Optuna: a trial is a run, and a study's file is shared by its workers.
+
+A trial belongs to the process that holds its lock. One whose worker died is taken up by whoever
+looks next and goes on from its checkpoint, so no heartbeat is needed.
+"""
+
+import json
+import shutil
+import sys
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from pacesetter import algorithms
+from pacesetter.cli.progress import Sink, console
+from pacesetter.config import settle
+from pacesetter.envs import make
+from pacesetter.errors import TrainingError, UsageError
+from pacesetter.runs import Row, RunDirectory
+from pacesetter.settings import Settings
+from pacesetter.storage import write_atomically
+from pacesetter.study.bench.suite import TUNING_SEEDS
+from pacesetter.study.tune.journal import (
+    alone,
+    distribution,
+    hold,
+    open_study,
+    optuna,
+    ranges,
+    refuse_foreign,
+)
+from pacesetter.training.trainer import Trainer
+
+RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
+PRUNED, FAILED = optuna.trial.TrialState.PRUNED, optuna.trial.TrialState.FAIL
+SAID = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
+LAST = 3  # evaluations that make a score, or a tenth of all
+
+
+class Tuning:
+    """One worker on a study of an algorithm on a task, with some settings fixed."""
+
+    def __init__(
+        self, algorithm: str, env: str, fixed: Settings, trials: int, file: str | Path
+    ) -> None:
+        self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
+        self.config, self.file = settle(algorithm, env, fixed), Path(file)
+        self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
+        self._refuse_bad_input()
+        self.best_file = self.file.with_suffix(".best.toml")
+        self.runs = self.file.with_name(f"{self.file.name}.runs")
+        self._lock = self.runs / "lock"
+        self._trainer: Trainer | None = None
+        self._stopping = False
+        settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
+        run = self.config.run
+        try:
+            self.runs.mkdir(parents=True, exist_ok=True)
+            with alone(self._lock):
+                patience = run.steps // run.eval_every // 3
+                self.study = open_study(self.file, settings, self.ranges, patience)
+        except OSError as error:
+            raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
+
+    def _refuse_bad_input(self) -> None:
+        """Before anything is written."""
+        if self.trials < 1:
+            raise UsageError(f"trials: must be at least 1, got {self.trials}")
+        for key in ("seed", "name"):
+            if key in self.fixed:
+                raise UsageError(f"{key}: trials have their own; seeds start at {TUNING_SEEDS}")
+        if not self.ranges:
+            raise UsageError("tune: no setting is left to search; each is given or has no range")
+        if not self.file.name or self.file.is_dir():
+            raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
+        refuse_foreign(self.file)
+        make(self.env, self.config.run.env_kwargs).close()
+
+    def stop(self) -> None:
+        """Ask for the end once the running trial has saved; may be called from a handler."""
+        self._stopping = True
+        if self._trainer is not None:
+            self._trainer.stop()
+
+    @property
+    def over(self) -> bool:
+        """Whether all trials have ended."""
+        trials = self.study.get_trials(deepcopy=False)
+        return sum(trial.state.is_finished() for trial in trials) >= self.trials
+
+    def run(self, quiet: bool = False) -> None:
+        """Make trials until all have ended or other workers are at them."""
+        while not self._stopping and (claim := self._claim()):
+            trial, lock = claim
+            with lock:
+                self._try(trial, quiet)
+            jax.clear_caches()  # each trial compiles programs of its own
+
+    def summary(self) -> str:
+        """How many trials there were and where the best settings are."""
+        states = [trial.state for trial in self.study.get_trials(deepcopy=False)]
+        complete, pruned, failed = (states.count(s) for s in (COMPLETE, PRUNED, FAILED))
+        text = f"{complete} trials, {pruned} pruned, {failed} failed"
+        if not complete:
+            return text
+        best = self.study.best_trial
+        return f"{text}; best {best.value:.1f} in trial {best.number}\nsettings: {self.best_file}"
+
+    def _claim(self) -> tuple[optuna.Trial, TextIOWrapper] | None:
+        """A trial that a dead worker left, or a new one, and its lock; None if there is none."""
+        with alone(self._lock):
+            for left in self.study.get_trials(deepcopy=False, states=(RUNNING,)):
+                if lock := hold(self.runs / f"{left.number}.lock"):
+                    # Optuna opens the trial of another process by nothing but this.
+                    identity = left._trial_id  # pyright: ignore[reportPrivateUsage]
+                    return optuna.Trial(self.study, identity), lock
+            begun = [t for t in self.study.get_trials(deepcopy=False) if t.state.name != "WAITING"]
+            if len(begun) >= self.trials:
+                return None
+            # Seeded by the number: one worker makes the same trials, however often it is stopped.
+            self.study.sampler = optuna.samplers.TPESampler(seed=len(begun))
+            trial = self.study.ask({name: distribution(r) for name, r in self.ranges.items()})
+            lock = hold(self.runs / f"{trial.number}.lock")
+            assert lock is not None
+            return trial, lock
+
+    def _try(self, trial: optuna.Trial, quiet: bool) -> None:
+        """Train one to its end, its pruning, a fault, or `stop`, which leaves it open."""
+        try:
+            self._trainer = trainer = self._trainer_of(trial)
+            with console(trainer, quiet) as sink:
+                pruned = self._train(trial, trainer, sink)
+        except (TrainingError, UsageError) as error:
+            self._tell(trial, FAILED, None, str(error))
+            return
+        if not (pruned or trainer.finished):
+            return
+        score = _score(trainer.directory.rows())
+        self._tell(trial, PRUNED if pruned else COMPLETE, None if pruned else score, f"{score:.1f}")
+        shutil.rmtree(trainer.directory.state_file.parent)  # replays of all would fill the disk
+
+    def _train(self, trial: optuna.Trial, trainer: Trainer, sink: Sink) -> bool:
+        """Whether it was pruned."""
+        if self._stopping:
+            trainer.stop()
+        told = self.study.get_trials(deepcopy=False)[trial.number].intermediate_values
+        every = self.config.run.eval_every * self.config.unit
+        for report in trainer:
+            sink(report)
+            number = report.step // every
+            if report.kind != "eval" or number == 0:
+                continue
+            if number not in told:  # a resumed run makes again what it had not saved
+                trial.report(_score(trainer.directory.rows()), number)
+            if trial.should_prune() and not trainer.finished:
+                return True
+        return False
+
+    def _trainer_of(self, trial: optuna.Trial) -> Trainer:
+        given: Settings = {**self.fixed, **trial.params}
+        given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
+        config = settle(self.algorithm, self.env, given)
+        directory = RunDirectory.of(self.runs, config)
+        if not directory.config_file.exists():
+            return Trainer(self.algorithm, self.env, runs=self.runs, **given)
+        try:
+            trainer = Trainer.resume(directory.path)
+        except UsageError as error:  # damaged, which is no reason to stop the study
+            raise TrainingError(str(error)) from None
+        for note in trainer.notes:
+            print(f"pacesetter: {note}", file=sys.stderr)
+        return trainer
+
+    def _tell(self, trial: optuna.Trial, state: Any, value: float | None, text: str) -> None:
+        with alone(self._lock):
+            self.study.tell(trial, value, state)
+            if any(t.state == COMPLETE for t in self.study.get_trials(deepcopy=False)):
+                best = self.study.best_trial
+                text = f"{text}, best {best.value:.1f} in trial {best.number}"
+                write_atomically(self.best_file, self._best_toml(best).encode())
+        print(
+            f"trial {trial.number} of {self.trials}: {SAID[state]} {text}",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def _best_toml(self, best: optuna.trial.FrozenTrial) -> str:
+        run = self.config.run
+        given = {k: self.config.settings()[k] for k in self.fixed if k not in ("steps", "time")}
+        lines = [
+            f"# pacesetter train {self.algorithm} {run.env} --config {self.best_file}",
+            f"# Return {best.value:.1f} at {run.steps:,} steps in trial {best.number}, with seed "
+            f"{TUNING_SEEDS + best.number}: the best of",
+            "# many, so biased upwards; only runs with other seeds tell what these settings give.",
+            *(f"{key} = {_toml(value)}" for key, value in (given | best.params).items()),
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def _score(rows: list[Row]) -> float:
+    """Mean return of the last evaluations, a tenth of them or LAST; that of step 0 never counts."""
+    means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
+    return float(np.mean(means[-max(LAST, len(means) // 10) :]))
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML, which reads JSON's numbers, words and lists."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+    return json.dumps(value)

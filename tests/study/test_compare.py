@@ -1,0 +1,470 @@
+"""Comparing runs: what is found, what is refused, what the tables say, and that all forms agree."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from compare import make_run
+
+from pacesetter.cli.main import main
+from pacesetter.errors import UsageError
+from pacesetter.runs import RunDirectory
+from pacesetter.study.compare import lineage, stats
+from pacesetter.study.compare.comparison import compare, split
+from pacesetter.study.compare.results import compact, gather
+from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
+from pacesetter.study.report.published import sources
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Five seeds of three algorithms on two tasks, each 100k steps with 20 evaluations."""
+    folder = tmp_path_factory.mktemp("runs")
+    for env in ("HalfCheetah-v5", "Ant-v5"):
+        for name, level in (("td3", 4_000.0), ("multi-td3", 3_000.0), ("sac", 5_000.0)):
+            for seed in range(5):
+                make_run(folder, env, name, seed, level=level, budget=100_000, evaluations=20)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def small(folder: Path, env: str = "Ant-v5", name: str = "td3", seed: int = 0, **more: Any) -> Path:
+    return make_run(folder, env, name, seed, budget=20_000, evaluations=10, **more)
+
+
+# Finding.
+
+
+def test_runs_are_found_by_folder_tail_pattern_and_file(runs: Path, tmp_path: Path) -> None:
+    def names(*words: str) -> list[str]:
+        found, empty = gather(words, runs)
+        assert not empty
+        return sorted(f"{run.env}/{run.name}/{run.seed}" for run in found)
+
+    td3 = [f"HalfCheetah-v5/td3/{seed}" for seed in range(5)]
+    assert names(str(runs / "HalfCheetah-v5" / "td3")) == td3
+    assert names("HalfCheetah-v5/td3") == td3
+    assert names("HalfCheetah-v5/td3/3") == td3[3:4]
+    assert names("HalfCheetah-*/td3") == td3
+    assert names("HalfCheetah-v5/t*/[01]") == td3[:2]
+    assert len(names("td3")) == 10
+    assert names("HalfCheetah-v5/td3", str(runs / "HalfCheetah-v5" / "td3" / "0")) == td3
+    file = tmp_path / "results.jsonl"
+    line = compact(RunDirectory(runs / "HalfCheetah-v5" / "td3" / "4"))
+    file.write_text(json.dumps(line) + "\n")
+    assert names(str(file)) == td3[4:]
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [("nothing/9", "'nothing/9' not found"), ("no*", "fits no run"), ("a.txt", "neither a run's")],
+)
+def test_what_is_not_found_is_one_line(runs: Path, word: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(UsageError, match=re.escape(said)):
+        gather([word], runs)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"commit": None, "versions": ...}, "no versions"),
+        ({"schema": 7}, "schema 7"),
+        ({"columns": ["step"]}, "columns must begin"),
+        ({"evaluations": [[0, [math.nan], 0, 0, 0, 0]]}, "not finite"),
+        ({"evaluations": [[0, [], 0, 0, 0, 0]]}, "division by zero"),
+        ({"evaluations": [[0]]}, "damaged or foreign"),
+        ({"settings": {}}, "is missing"),
+    ],
+)
+def test_a_foreign_line_is_refused(
+    runs: Path, tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    line = compact(RunDirectory(runs / "Ant-v5" / "td3" / "0")) | change
+    line = {key: value for key, value in line.items() if value is not ...}
+    file = tmp_path / "results.jsonl"
+    file.write_text(json.dumps(line) + "\n")
+    with pytest.raises(UsageError, match=said):
+        gather([file])
+
+
+# What may stand side by side.
+
+
+def test_several_versions_of_a_task_are_refused_unless_mixed(tmp_path: Path) -> None:
+    small(tmp_path, "Ant-v4")
+    small(tmp_path, "Ant-v5")
+    with pytest.raises(UsageError, match=r"Ant in the versions v4, v5.*--mixed"):
+        compare([tmp_path])
+    found = compare([tmp_path], mixed=True)
+    assert found.envs == ["Ant-v4", "Ant-v5"]
+    assert "Mixed, so no fair comparison: env: Ant in the versions v4, v5." in found.notes
+    assert re.search(r"\(v4, .*\(v5, ", tables.plain([contents.overview(found)]))
+
+
+def test_several_budgets_are_refused_unless_cut_or_mixed(tmp_path: Path) -> None:
+    small(tmp_path, seed=0)
+    make_run(tmp_path, "Ant-v5", "td3", 1, budget=40_000, evaluations=20)
+    with pytest.raises(UsageError, match=r"runs of 20,000, 40,000 env steps; --budget"):
+        compare([tmp_path])
+    assert compare([tmp_path], mixed=True).budget is None
+    cut = compare([tmp_path], budget="20k")
+    assert cut.budget == 20_000
+    assert [len(run.steps) for run in cut.runs] == [11, 11]
+    assert [run.updates[-1] for run in cut.runs] == [0, 0]  # a cut run's ledger is cut too
+
+
+def test_equal_cpu_time_cuts_each_run_where_it_stood(tmp_path: Path) -> None:
+    """Runs of other lengths need no --mixed then; one that never spent so much is left out."""
+    small(tmp_path, seed=0)
+    make_run(tmp_path, "Ant-v5", "td3", 1, budget=40_000, evaluations=20)
+    spent = sorted(run.cpu[-1] for run in compare([tmp_path], mixed=True).runs)
+    cut = compare([tmp_path], cpu=spent[0])
+    assert len(cut.runs) == 2
+    assert all(run.cpu[-1] <= spent[0] for run in cut.runs)
+    assert f"Every run counts up to {spent[0]:,.0f} CPU seconds." in cut.notes
+    alone = compare([tmp_path], cpu=spent[1])
+    assert [run.seed for run in alone.runs] == [1]
+    assert "CPU seconds)" in alone.notes[0]
+    with pytest.raises(UsageError, match="cpu: cuts runs at another place than --budget"):
+        compare([tmp_path], cpu="1m", budget="10k")
+
+
+def test_a_setting_that_only_newer_runs_have_is_no_difference(tmp_path: Path) -> None:
+    small(tmp_path, seed=0)
+    small(tmp_path, seed=1, count_selection_steps=True)
+    assert len(compare([tmp_path]).runs) == 2
+
+
+def test_uncounted_selection_steps_are_told(tmp_path: Path) -> None:
+    small(tmp_path, name="multi-td3", count_selection_steps=False)
+    assert any("Steps of selection come on top" in note for note in compare([tmp_path]).notes)
+
+
+def test_the_paper_suites_ant_stands_in_the_papers_tables(tmp_path: Path) -> None:
+    make_run(tmp_path, "pacesetter/Ant111-v4", "multi-td3", budget=20_000, evaluations=10)
+    text = tables.plain(paper.tables(compare([tmp_path])))
+    assert "(v4, 111, n=1, 20k" in text
+
+
+def test_other_settings_under_one_name_are_refused(tmp_path: Path) -> None:
+    small(tmp_path, seed=0)
+    small(tmp_path, seed=1, batch_size=100)
+    with pytest.raises(UsageError, match="td3 has batch_size 256 and 100"):
+        compare([tmp_path])
+    assert "batch_size" in compare([tmp_path], mixed=True).notes[0]
+
+
+def test_the_same_seed_twice_is_refused(tmp_path: Path) -> None:
+    small(tmp_path / "a")
+    small(tmp_path / "b")
+    with pytest.raises(UsageError, match="both Ant-v5 td3 seed 0"):
+        compare([tmp_path])
+
+
+def test_unfinished_runs_are_left_out_and_named(tmp_path: Path) -> None:
+    for seed in range(3):
+        small(tmp_path, seed=seed)
+    short = make_run(tmp_path, "Ant-v5", "td3", 3, budget=10_000, evaluations=5, planned=20_000)
+    started = small(tmp_path, seed=4)
+    (started / "metrics.jsonl").write_text("")
+    found = compare([tmp_path])
+    assert [run.seed for run in found.runs] == [0, 1, 2]
+    assert f"{short} (10,000 of 20,000 env steps)" in found.notes[0]
+    assert f"{started} (no evaluation)" in found.notes[0]
+    assert "Indicative only, for fewer than 5 seeds: Ant-v5 td3 (n=3)." in found.notes
+    with pytest.raises(UsageError, match="none is complete"):
+        compare([short])
+
+
+def test_a_run_that_its_time_limit_ended_counts(tmp_path: Path) -> None:
+    make_run(tmp_path, budget=10_000, evaluations=5, planned=20_000, time=40.0)
+    assert compare([tmp_path]).budget == 10_000
+
+
+def test_evaluations_count_at_the_steps_at_which_they_were_due(tmp_path: Path) -> None:
+    """Two members end a tick a step late; the last one stops at an odd budget."""
+    path = make_run(tmp_path, budget=10_000, evaluations=5, planned=10_500)
+    rows = RunDirectory(path).rows()
+    for row in rows:
+        row["step"] += row["step"] == 8_000
+    rows.append([row for row in rows if row["kind"] == "eval"][-1] | {"step": 10_500})
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (run,) = gather([path])[0]
+    assert run.clock.tolist() == [0, 2_000, 4_000, 6_000, 8_000, 10_000, 10_500]
+    assert run.steps[4] == 8_001
+    assert run.finished
+    assert run.cut(8_000).clock[-1] == 8_000
+
+
+# Numbers.
+
+
+def test_tables_hold_the_statistics_of_the_rows(runs: Path) -> None:
+    found = compare([runs])
+    group = found.find("Ant-v5", "td3")
+    assert group is not None
+    finals: list[float] = []
+    for seed in range(5):
+        rows = RunDirectory(runs / "Ant-v5" / "td3" / str(seed)).rows()
+        finals.append(np.mean([row["mean"] for row in rows if row["kind"] == "eval"][-3:]))
+    np.testing.assert_allclose(group.values("final"), finals, atol=1e-3)
+    mean = stats.mean(np.array(finals))
+    cell = contents.overview(found).rows[0][1]
+    assert cell.text == f"{mean.value:,.0f} [{mean.low:,.0f}; {mean.high:,.0f}] (v5, n=5, 100k)"
+    assert found.names == ["td3", "multi-td3", "sac"]
+    control = contrasts.against(found)[0].rows
+    assert [row[1].text for row in control] == ["multi-td3", "sac"] * 2
+
+
+def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path) -> None:
+    """Ant's untrained policy stands still for a return of 1,000."""
+    path = make_run(tmp_path, "Ant-v5", budget=100_000, evaluations=20, level=500)
+    rows = RunDirectory(path).rows()
+    for row in rows:
+        if row["kind"] == "eval" and row["step"] <= 25_000:
+            row["returns"] = [1_001.0]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (run,) = gather([path])[0]
+    assert run.metric("max") < 800
+    assert run.reached(1_000) == math.inf
+
+
+def test_every_results_table_has_its_ledger_and_versions(runs: Path) -> None:
+    found = compare([runs])
+    shown = output.everything(found, output.Options(published=True))
+    titles = [table.title for table in shown]
+    assert titles == [
+        "Final return",
+        "Each group",
+        "Better rewards sooner",
+        "Against td3",
+        "All tasks together",
+        "Best of two independent runs",
+        "Selections",
+        "The paper's table I",
+        "The paper's table II",
+        "Published returns",
+    ]
+    for table in shown:
+        assert table.ledger is not None
+        assert table.ledger.headers[3:] == [
+            "env steps",
+            "updates",
+            "transitions",
+            "CPU s",
+            "wall s",
+        ]
+        assert all(len(row) == len(table.headers) for row in table.rows)
+    for which in ("I", "II"):
+        table = paper.paper_table(found, which)
+        assert table is not None
+        cells = [cell.text for row in table.rows for cell in row[2:] if cell.text != "-"]
+        assert all(re.search(r" \(v[1-5], n=", cell) for cell in cells)
+    words = [row[2].text for row in paper.published(found).rows]  # pyright: ignore
+    assert all(re.search(r"\(v[1-5]\)$", word) for word in words)
+
+
+def test_what_an_algorithm_counts_of_its_own_is_in_the_ledger(tmp_path: Path) -> None:
+    path = small(tmp_path)
+    rows = [row | {"model_steps": 7 * row["step"]} for row in RunDirectory(path).rows()]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    small(tmp_path, name="sac")
+    ledger = contents.ledger(compare([tmp_path], budget=10_000).groups)
+    assert ledger.headers[-1] == "model steps"
+    assert [row[-1].text for row in ledger.rows] == ["0", "70,000"]
+
+
+def test_best_of_two_spends_what_it_says(runs: Path) -> None:
+    found = compare([runs])
+    group = found.find("Ant-v5", "td3")
+    assert group is not None
+    row = contrasts.best_of_two(found)[0].rows[0]
+    half = stats.best_of_two(group.cut(50_000).values("final"))
+    whole = stats.best_of_two(group.values("final"))
+    assert [cell.key for cell in row[-2:]] == [half.value, whole.value]
+    assert half.value < whole.value > group.values("final").mean()
+
+
+def test_results_of_a_file_equal_those_of_the_runs(runs: Path, tmp_path: Path) -> None:
+    file = tmp_path / "results.jsonl"
+    lines = [compact(RunDirectory(path.parent)) for path in runs.rglob("config.json")]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    a, b = compare([runs]), compare([file])
+    assert tables.plain(output.everything(a, output.Options())) == tables.plain(
+        output.everything(b, output.Options())
+    )
+    assert a.notes == b.notes
+
+
+def test_scores_are_over_the_published_scale(runs: Path) -> None:
+    found = compare([runs])
+    group = found.find("Ant-v5", "td3")
+    assert group is not None
+    scores = contrasts.shared(found)["td3"]
+    np.testing.assert_allclose(scores[0], group.values("final") / 4185)
+    one = compare([runs / "Ant-v5"])
+    assert contrasts.shared(one) == {}
+    assert contrasts.together(one) == []
+
+
+# Lineages.
+
+
+def test_lineages_are_followed_through_copies() -> None:
+    rows = [
+        [10, 5.0, 10.0, [0, 0, 2], 0],
+        [20, 30.0, 10.0, [1, 1, 2], 1],
+        [30, 0.0, 0.0, [0, 0, 1], 2],
+    ]
+    found = lineage.Selections.of(rows)
+    assert found.ancestors.tolist() == [[0, 0, 2], [0, 0, 2], [0, 0, 0]]
+    assert found.founding == "0, since selection 3"
+    assert found.line == [0, 1, 1]  # place 2 comes from 1, which came from 1, which came from 0
+    assert found.ratios.tolist() == [0.5, 3.0, 0.0]
+    assert found.flips.tolist() == [True, False, True]
+    assert lineage.Selections.of(rows[:2]).founding == "2 of 3 founders left"
+
+
+def test_a_line_is_shortened_at_its_start() -> None:
+    assert lineage.shorten([0, 1, 1, 0]) == "0 1x2 0"
+    assert lineage.shorten([0, 1] * 10, most=3) == "... 1 0 1"
+
+
+# Curves.
+
+
+def test_curves_are_the_mean_of_evaluations_on_each_axis(runs: Path) -> None:
+    group = compare([runs]).find("Ant-v5", "td3")
+    assert group is not None
+    line = curves.curve(group, "steps")
+    np.testing.assert_allclose(line.x, group.runs[0].clock)
+    np.testing.assert_allclose(line.mean, np.mean([run.returns for run in group.runs], axis=0))
+    updates = curves.curve(group, "updates")
+    assert updates.x[0] == 0
+    assert updates.mean[0] == pytest.approx(line.mean[5])  # 25,000 steps, the last without updates
+    for axis in ("cpu", "wall"):
+        assert curves.curve(group, axis).mean[-1] == pytest.approx(line.mean[-1])
+
+
+def test_algorithms_of_the_paper_keep_their_colours() -> None:
+    found = curves.style(["td3", "a", "multi-td3", *(f"b{n}" for n in range(6))])
+    assert found["multi-td3"] == ("#0072B2", "")
+    assert found["td3"] == ("#D55E00", "")
+    assert len(set(found.values())) == len(found)
+
+
+def test_published_numbers_are_whole() -> None:
+    for source in sources():
+        assert source["version"] in {"v1", "v2", "v3", "v4"}
+        assert source["cite"]
+        assert ("budget" in source) + ("budgets" in source) + ("said" in source) == 1
+        for values in source["returns"].values():
+            assert len(values) == len(source["budgets"]) if "budgets" in source else values
+    assert split("pacesetter/Ant111-v4") == ("Ant", "v4, 111")
+
+
+# The command.
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    def run(*words: object) -> tuple[int, str, str]:
+        code = main(["compare", *map(str, words)])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+def test_without_a_file_a_table_is_printed(runs: Path, command: Any) -> None:
+    code, out, err = command(runs, "--metric", "auc")
+    assert (code, err) == (0, "")
+    assert out.startswith("Mean return of training\n")
+    assert "Ledger: spent by a mean run" in out
+    assert "Against td3" in out
+
+
+def test_files_are_written_in_each_form(runs: Path, tmp_path: Path, command: Any) -> None:
+    words = ["-o", "a.md", "-o", "a.tex", "-o", "a.pdf", "--published", "--smooth", "5"]
+    code, out, _ = command(runs, *words)
+    assert (code, out.split()) == (0, ["a.md", "a.tex", "a.pdf"])
+    markdown, tex = Path("a.md").read_text(), Path("a.tex").read_text()
+    assert markdown.count("Ledger: spent by a mean run:") == 10
+    assert tex.count("\\begin{table}") == tex.count("\\end{table}") == 11
+    assert "11719$\\pm$" not in tex
+    assert "12,139.5 $\\pm$ 292.7 (v2, n=3, 1M episodes)" in tex
+    assert not re.search(r"(?<!\\)%", re.sub(r"^%.*|\{%$", "", tex, flags=re.M))
+    pdf = Path("a.pdf").read_bytes()
+    assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") == 6
+
+
+def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> None:
+    command(runs, "-o", "a.html", "--no-film", "--smooth", "9")
+    command(runs, "-o", "b.html", "--no-film")
+    a, b = Path("a.html").read_text(), Path("b.html").read_text()
+    assert "Savitzky-Golay, window 9, order 3" in a
+    assert "Savitzky-Golay" not in b
+    rows = [re.findall(r"<td.*?</td>", page) for page in (a, b)]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--metric", "best"], "metric: unknown 'best'"),
+        (["--budget", "many"], "budget: is not a count"),
+        (["-o", "a.doc"], "-o: a.doc must end in .html"),
+        (["-o", "none/a.md"], "-o: none is no folder"),
+        (["--smooth", "4"], "smooth: must be an odd number"),
+        (["--budget", "1M"], "none is complete"),
+    ],
+)
+def test_bad_words_are_one_line(
+    runs: Path, command: Any, words: list[str], said: str, tmp_path: Path
+) -> None:
+    code, out, err = command(runs, *words)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert said in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_imports_neither_jax_nor_scipy() -> None:
+    code = (
+        "import sys\nfrom pacesetter.cli import main\n"
+        "try:\n    main(['compare', '--help'])\nexcept SystemExit:\n    pass\n"
+        "print({'jax', 'scipy', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("set()\n")
+
+
+def test_comparing_imports_no_jax(runs: Path) -> None:
+    code = (
+        "import sys\nfrom pacesetter.cli import main\n"
+        f"main(['compare', {str(runs)!r}, '-o', 'a.html', '--no-film'])\n"
+        "print('jax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "a.html\nFalse\n"
+
+
+def test_the_reported_tables_come_from_the_repository(tmp_path: Path) -> None:
+    script = [sys.executable, ROOT / "results" / "summary.py", "--figures", tmp_path]
+    done = subprocess.run(script, capture_output=True, text=True, check=True)
+    assert "# pilot: budget 100k" in done.stdout
+    assert (tmp_path / "pilot.pdf").read_bytes().startswith(b"%PDF")

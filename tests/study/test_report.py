@@ -1,0 +1,249 @@
+"""The report in a real browser: one file, no errors, sortable, readable narrow and by keyboard."""
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from compare import make_run
+from test_media import untrained
+
+from pacesetter.cli.main import main
+from pacesetter.errors import UsageError
+from pacesetter.media.record import INSTALL
+from pacesetter.runs import RunDirectory
+from pacesetter.study.compare.results import compact
+from pacesetter.study.report import html as report
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+DRIVER = shutil.which("chromedriver")
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-sync "
+    "--disable-background-networking --disable-component-update --hide-scrollbars"
+)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    for env in ("HalfCheetah-v5", "Walker2d-v5"):
+        for name, level in (("td3", 4_000.0), ("multi-td3", 3_000.0)):
+            for seed in range(5):
+                make_run(folder, env, name, seed, level=level, budget=100_000, evaluations=20)
+    return folder
+
+
+def write(path: Path, *words: object) -> str:
+    assert main(["compare", *map(str, words), "-o", str(path)]) == 0
+    return path.read_text()
+
+
+@pytest.fixture(scope="module")
+def page(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    write(path, runs, "--published", "--no-film")
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    if not CHROMIUM or not DRIVER:
+        pytest.skip("no Chromium: apt-get install -y chromium chromium-driver")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.options import Options
+    from selenium.webdriver.chrome.service import Service
+
+    options = Options()
+    options.binary_location = CHROMIUM
+    for flag in [*FLAGS.split(), f"--user-data-dir={tmp_path_factory.mktemp('profile')}"]:
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    found: Any = webdriver.Chrome(options=options, service=Service(DRIVER))
+    try:
+        yield found
+    finally:
+        found.quit()
+
+
+@pytest.fixture
+def opened(browser: Any, page: Path) -> Any:
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    browser.set_window_size(1280, 900)
+    browser.get(page.as_uri())
+    return browser
+
+
+def column(browser: Any, table: int, place: int) -> list[str]:
+    script = (
+        "return [...document.querySelectorAll('table.sortable')[arguments[0]].tBodies[0].rows]"
+        ".map(row => row.cells[arguments[1]].firstChild.textContent.trim())"
+    )
+    return browser.execute_script(script, table, place)
+
+
+def test_page_is_one_file_that_asks_nobody(page: Path) -> None:
+    text = page.read_text()
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", text)
+    assert not re.search(r"@import|url\((?!#|data:)|fetch\(|XMLHttpRequest", text)
+    assert text.count("<script") == 2
+
+
+def test_page_opens_without_errors_or_requests(opened: Any) -> None:
+    assert opened.get_log("browser") == []
+    loaded = "return performance.getEntriesByType('resource').map(entry => entry.name)"
+    assert [name for name in opened.execute_script(loaded) if not name.startswith("data:")] == []
+    charts = "return document.querySelectorAll('.chart').length"
+    assert opened.execute_script(charts) == 3  # two tasks and the profile
+
+
+def test_tables_sort_by_number_and_back(opened: Any) -> None:
+    header = "return [...document.querySelectorAll('table.sortable')].findIndex("
+    header += "table => table.tHead.textContent.includes('SD over seeds'))"
+    table = opened.execute_script(header)
+    button = opened.execute_script(
+        "return document.querySelectorAll('table.sortable')[arguments[0]]"
+        ".querySelectorAll('th button')[3]",
+        table,
+    )
+    for way, reverse in (("ascending", False), ("descending", True)):
+        opened.execute_script("arguments[0].click()", button)
+        finals = [float(t.split(" ")[0].replace(",", "")) for t in column(opened, table, 3)]
+        assert finals == sorted(finals, reverse=reverse)
+        state = "return arguments[0].parentElement.getAttribute('aria-sort')"
+        assert opened.execute_script(state, button) == way
+
+
+def test_algorithms_and_axes_are_switched(opened: Any) -> None:
+    lines = "return document.querySelectorAll('.chart')[0].querySelectorAll('path[fill=none]')"
+    assert len(opened.execute_script(lines)) == 2
+    boxes = opened.find_elements("css selector", "#names input")
+    boxes[0].click()
+    assert len(opened.execute_script(lines)) == 1
+    boxes[0].click()
+    boxes[-1].click()  # each seed
+    assert len(opened.execute_script(lines)) == 2 + 10
+    opened.find_elements("css selector", "#axes input")[1].click()
+    words = "return document.querySelectorAll('.chart')[0].querySelector('svg').textContent"
+    assert "gradient updates" in opened.execute_script(words)
+
+
+def test_a_chart_is_read_by_mouse_and_by_keyboard(opened: Any) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.keys import Keys
+
+    chart = opened.find_element("css selector", ".chart svg")
+    values = opened.find_element("css selector", ".chart .values")
+    ActionChains(opened).move_to_element(chart).perform()
+    assert re.search(r"env steps.*td3 \d+ \[.*multi-td3 \d+ \[", values.text, re.S)
+    ActionChains(opened).move_by_offset(0, -400).perform()
+    opened.execute_script("arguments[0].focus()", chart)
+    chart.send_keys(Keys.ARROW_RIGHT)
+    assert "env steps, all members 0" in values.text
+    chart.send_keys(Keys.ARROW_RIGHT)
+    assert "env steps, all members 2500" in values.text
+    outline = "return getComputedStyle(arguments[0]).outlineStyle"
+    assert opened.execute_script(outline, chart) == "solid"
+
+
+def test_every_control_is_reached_by_tab(opened: Any) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    reached: set[str] = set()
+    for _ in range(60):
+        opened.switch_to.active_element.send_keys(Keys.TAB)
+        reached.add(opened.execute_script("return document.activeElement.localName"))
+    assert {"a", "button", "input", "svg", "div", "summary"} <= reached
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_overflows_the_page(opened: Any, width: int) -> None:
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    opened.refresh()
+    assert opened.execute_script("return document.documentElement.scrollWidth") == width
+    outside = """
+        const clipped = [];
+        for (const svg of document.querySelectorAll('.chart svg')) {
+            const box = svg.getBoundingClientRect();
+            for (const text of svg.querySelectorAll('text')) {
+                const one = text.getBoundingClientRect();
+                if (one.left < box.left - 1 || one.right > box.right + 1
+                    || one.bottom > box.bottom + 1) clipped.push(text.textContent);
+            }
+        }
+        return clipped;
+    """
+    assert opened.execute_script(outside) == []
+    smallest = """
+        return Math.min(...[...document.querySelectorAll('.chart text, td, p, label, th')]
+            .map(one => parseFloat(getComputedStyle(one).fontSize)));
+    """
+    assert opened.execute_script(smallest) >= 12
+
+
+def test_words_from_runs_are_shown_as_words(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "runs", budget=20_000, evaluations=10)
+    config = json.loads((run / "config.json").read_text())
+    evil = "</script><script>alert(1)</script>"
+    config["settings"]["env"] = f"{evil}-v1"
+    config["command"] = evil
+    (run / "config.json").write_text(json.dumps(config))
+    text = write(tmp_path / "report.html", run, "--no-film")
+    assert evil not in text
+    assert "\\u003c/script>" in text
+    assert "&lt;/script&gt;" in text
+
+
+def test_the_champions_film_is_in_the_page(runs: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(runs, tmp_path / "runs")
+    for run in folder.rglob("config.json"):
+        env = run.parent.parent.parent.name
+        untrained(env, step=100_000).save(run.parent / "policy.safetensors")
+    films = report.FILM_FRAMES, report.FILM_SIZE
+    try:
+        report.FILM_FRAMES, report.FILM_SIZE = 3, (32, 32)
+        text = write(tmp_path / "report.html", folder)
+    finally:
+        report.FILM_FRAMES, report.FILM_SIZE = films
+    if INSTALL in text:
+        pytest.skip("no OpenGL to draw with; the page says so")
+    assert text.count("data:video/mp4;base64,AAAA") == 2
+    assert "the policy of step 100,000" in text
+
+
+def test_a_page_without_a_film_says_why_in_one_line(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*words: Any, **more: Any) -> int:
+        raise UsageError(f"video: no OpenGL to draw with; {INSTALL}")
+
+    run = shutil.copytree(runs / "Walker2d-v5", tmp_path / "runs" / "Walker2d-v5")
+    for config in run.rglob("config.json"):
+        untrained("Walker2d-v5").save(config.parent / "policy.safetensors")
+    monkeypatch.setattr("pacesetter.media.record.record", refuse)
+    text = write(tmp_path / "a.html", tmp_path / "runs")
+    assert f"no film: video: no OpenGL to draw with; {INSTALL}" in text
+    assert "<video" not in text
+    file = tmp_path / "results.jsonl"
+    lines = [compact(RunDirectory(config.parent)) for config in run.rglob("config.json")]
+    file.write_text("".join(json.dumps(line) + os.linesep for line in lines))
+    assert "no film, since results hold no policy" in write(tmp_path / "b.html", file)
+
+
+def test_one_short_run_without_an_update_is_drawn(browser: Any, tmp_path: Path) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    run = make_run(tmp_path / "runs", budget=20_000, evaluations=10)
+    write(tmp_path / "report.html", run, "--no-film")
+    browser.get((tmp_path / "report.html").as_uri())
+    for axis in browser.find_elements("css selector", "#axes input"):
+        axis.click()
+        chart = browser.find_element("css selector", ".chart svg")
+        browser.execute_script("arguments[0].focus()", chart)
+        chart.send_keys(Keys.ARROW_RIGHT)
+        assert "NaN" not in browser.find_element("css selector", ".chart").get_property("outerHTML")
+    assert browser.get_log("browser") == []

@@ -1,0 +1,360 @@
+"""Runs that are killed, asked to stop, or fail by a NaN lose nothing that a checkpoint holds."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import broken_envs
+import jax
+import numpy as np
+import pytest
+from broken_envs import Late
+
+from conftest import TINY, assert_same, run_to_end
+from pacesetter import storage
+from pacesetter.cli.main import main
+from pacesetter.errors import TrainingError
+from pacesetter.replay import buffer
+from pacesetter.runs import RunDirectory, find_all
+from pacesetter.training.trainer import Trainer
+
+# The ring in small, so that it goes round several times within one short run.
+RING = {"BLOCK": 64, "UNCOMMITTED": 150, "SLACK": 364}
+COMMAND = f"""
+import sys
+from pacesetter.training import replay
+vars(replay).update({RING})
+from pacesetter.cli import main
+sys.exit(main())
+"""
+FLAGS = ["--hidden", "16", "16", "--batch-size", "16", "--warmup", "200", "--replay-size", "300"]
+FLAGS += ["--eval-episodes", "1", "--eval-every", "1000", "--checkpoint-every", "0.3s", "-q"]
+KILLED = {
+    "HalfCheetah-v5": ["train", "td3", "HalfCheetah-v5", "--steps", "3000", *FLAGS],
+    "Ant-v5": ["train", "multi-td3", "Ant-v5", "--steps", "1600", *FLAGS],
+}
+PATIENCE = 120
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_ring() -> Iterator[None]:
+    """This process's ring is as small as the subprocesses'."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in RING.items():
+            patch.setattr(buffer, name, value)
+        yield
+
+
+def start(words: list[str], runs: Path, *program: str) -> subprocess.Popen[str]:
+    """A command as a process of its own."""
+    command = [sys.executable, *(program or ("-c", COMMAND)), *words, "--runs", str(runs)]
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    # Background jobs of some shells ignore SIGINT, and children inherit that.
+    return subprocess.Popen(command, **pipes, text=True, env=dict(os.environ))
+
+
+def wait_for(what: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    """Until `what` is true while the process runs."""
+    end = time.monotonic() + PATIENCE
+    while not what():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def only_run(runs: Path) -> RunDirectory:
+    """The only run below a folder."""
+    (config,) = runs.rglob("config.json")
+    return RunDirectory(config.parent)
+
+
+def litter(directory: RunDirectory) -> list[Path]:
+    return list(directory.path.rglob(f"*{storage.TEMPORARY}"))
+
+
+def saved_step(directory: RunDirectory) -> int:
+    """Step of the newest checkpoint; reading it fails if it is not whole."""
+    progress = storage.read(directory.state_file, "checkpoint").table["progress"]
+    return sum(member["steps"] for member in progress["members"]) + progress["selection_steps"]
+
+
+def training(runs: Path) -> bool:
+    """Whether the only run below a folder has a checkpoint and a process that goes on with it."""
+    return any(run.in_use() and run.state_file.exists() for run in find_all(runs))
+
+
+def _has_saved_beyond(directory: RunDirectory, step: int) -> bool:
+    return saved_step(directory) > step
+
+
+def kill_and_resume(env: str, tmp_path: Path, kills: int, seed: int) -> RunDirectory:
+    """Kill a run many times, most of them after it has saved something new; then let it end."""
+    rng = np.random.default_rng(seed)
+    runs, words, saved = tmp_path / "killed", KILLED[env], 0
+    for number in range(kills):
+        process = start(words, runs)
+        wait_for(partial(training, runs), process)
+        directory = only_run(runs)
+        words = ["resume", str(directory.path)]
+        if number % 3:  # the others die wherever they are, early ones before the first save
+            wait_for(partial(_has_saved_beyond, directory, saved), process)
+        time.sleep(float(rng.uniform(0, 0.6)))
+        process.kill()
+        process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGKILL
+        assert not directory.in_use()
+        step = saved_step(directory)
+        assert step > saved if number % 3 else step >= saved
+        saved = step
+    trainer = Trainer.resume(directory.path)
+    assert trainer.notes == []
+    assert trainer.progress.step == saved > 0
+    assert litter(directory) == []
+    run_to_end(trainer)
+    assert trainer.finished
+    assert not directory.in_use()
+    assert litter(directory) == []
+    return directory
+
+
+Undisturbed = Callable[[str], RunDirectory]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    """The run of KILLED on a task that was left alone, made once."""
+
+    @cache
+    def make(env: str) -> RunDirectory:
+        runs = tmp_path_factory.mktemp("whole")
+        assert main([*KILLED[env], "--runs", str(runs)]) == 0
+        return only_run(runs)
+
+    return make
+
+
+@pytest.mark.parametrize("env", ["HalfCheetah-v5", pytest.param("Ant-v5", marks=pytest.mark.slow)])
+def test_killed_run_equals_undisturbed(env: str, tmp_path: Path, undisturbed: Undisturbed) -> None:
+    assert_same(undisturbed(env), kill_and_resume(env, tmp_path, kills=3, seed=len(env)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", KILLED)
+def test_run_killed_often_equals_undisturbed(
+    env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(KILLED, env, [*KILLED[env], "--steps", "120000"])
+    directory = kill_and_resume(env, tmp_path, kills=40, seed=3)
+    assert main([*KILLED[env], "--runs", str(tmp_path / "whole")]) == 0
+    assert_same(only_run(tmp_path / "whole"), directory)
+
+
+@pytest.mark.slow
+def test_killed_run_with_models_equals_undisturbed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """STEVE's models, their optimiser and the rows that each learns from go on as they were."""
+    words = ["train", "multi-steve-td3", "Hopper-v5", "--steps", "4000", *FLAGS]
+    words += ["--model-hidden", "8", "--head-hidden", "8", "--critic-members", "2"]
+    monkeypatch.setitem(KILLED, "Hopper-v5", words)
+    killed = kill_and_resume("Hopper-v5", tmp_path, kills=3, seed=1)
+    assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
+    assert_same(only_run(tmp_path / "whole"), killed)
+
+
+# Signals.
+
+
+ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGUSR1: 143}
+
+
+def test_signals_save_and_end(tmp_path: Path, undisturbed: Undisturbed) -> None:
+    """Each signal in turn, then on to the end: nothing is lost, nothing repeated."""
+    runs, words = tmp_path / "stopped", KILLED["HalfCheetah-v5"]
+    steps = [0]
+    for number, code in ENDS.items():
+        process = start(words, runs)
+        wait_for(partial(training, runs), process)
+        directory = only_run(runs)
+        wait_for(partial(_has_saved_beyond, directory, steps[-1]), process)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, err) == (code, "")
+        assert f"saved; go on with `pacesetter resume {directory.path}`" in out
+        steps.append(saved_step(directory))
+        said = re.search(r": ([\d,]+) steps", out)
+        assert said
+        assert int(said[1].replace(",", "")) == steps[-1] > steps[-2]
+        assert not directory.in_use()
+        assert litter(directory) == []
+        words = ["resume", str(directory.path)]
+    assert steps[-1] < 3000
+    assert_same(undisturbed("HalfCheetah-v5"), run_to_end(Trainer.resume(directory.path)))
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_signal_before_there_is_a_run(number: signal.Signals, tmp_path: Path) -> None:
+    """While JAX is imported, which a signal must neither break nor lose: the run saves and ends."""
+    process = start(KILLED["HalfCheetah-v5"], tmp_path, "-m", "pacesetter")
+    libraries = Path(f"/proc/{process.pid}/maps")
+    wait_for(lambda: "jaxlib" in libraries.read_text(), process)
+    assert not any(find_all(tmp_path))
+    process.send_signal(number)
+    out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, err) == (ENDS[number], "")
+    assert f"saved; go on with `pacesetter resume {only_run(tmp_path).path}`" in out
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
+    """The first waits for a long evaluation to end, the second for nothing; resume goes on."""
+    words = ["train", "td3", "HalfCheetah-v5", "--steps", "500", *FLAGS]
+    process = start([*words, "--eval-episodes", "10000"], tmp_path)
+    wait_for(partial(training, tmp_path), process)
+    process.send_signal(number)
+    time.sleep(0.5)
+    assert process.poll() is None
+    before = time.monotonic()
+    process.send_signal(number)
+    out, err = process.communicate(timeout=PATIENCE)
+    assert time.monotonic() - before < 2
+    assert (process.returncode, out, err) == (128 + number, "", "")
+    directory = only_run(tmp_path)
+    assert not directory.in_use()
+    trainer = Trainer.resume(directory.path)
+    assert trainer.notes == []
+    trainer.close()
+
+
+# Faults at a late step.
+
+FAULTS = {
+    "nan": "observation: must be finite, number 2 is nan",
+    "reward": "reward: must be finite in float32, it is -inf",
+    "error": "a bolt fell out",
+}
+
+
+@pytest.fixture
+def disarmed() -> Iterator[None]:
+    """No task of this test fails after it."""
+    yield
+    Late.disarm()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
+    """The run of `late` when nothing fails."""
+    return run_to_end(late(tmp_path_factory.mktemp("whole")))
+
+
+def late(runs: Path, **settings: Any) -> Trainer:
+    """A run of two members on a task that may fail; it saves about every 20 ms."""
+    settings = {**TINY, "steps": 900, "checkpoint_every": 0.02, "members": 2, **settings}
+    return Trainer("td3", "broken_envs:Late-v0", runs=runs, **settings)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_of_env_stops_the_run(
+    fault: str,
+    whole: RunDirectory,
+    tmp_path: Path,
+    disarmed: None,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """One line names member and step; without the fault the run goes on as if it had not been."""
+    # Member 1 acts second in each tick; its own 300th step comes when the run has made 599.
+    Late.arm(fault, victim=1, at=300)
+    trainer = late(tmp_path / "faulty")
+    with pytest.raises(TrainingError, match=f"member 1, step 599: .*{FAULTS[fault]}"):
+        run_to_end(trainer)
+    directory = trainer.directory
+    assert not directory.in_use()
+    assert 0 < saved_step(directory) < 600
+    Late.arm(fault, victim=1, at=saved_step(directory) // 2 % broken_envs.EPISODE + 5)
+    assert main(["resume", str(directory.path), "-q"]) == 1
+    error = capsys.readouterr().err
+    assert re.fullmatch(r"pacesetter: stopped: member 1, step \d+: [^\n]+\n", error), error
+    Late.disarm()
+    run_to_end(Trainer.resume(directory.path))
+    assert_same(whole, directory)
+
+
+def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:
+    """The env of evaluations is number 2."""
+    Late.arm("nan", victim=2, at=150)
+    trainer = late(tmp_path, eval_every=300)
+    with pytest.raises(TrainingError, match=r"member \d, step 300: .*observation"):
+        run_to_end(trainer)
+    assert not trainer.directory.in_use()
+
+
+def poison(trainer: Trainer, field: str, member: int, value: float) -> None:
+    """Put a number into the first array of a part of one member's state."""
+    states = trainer.ensemble.states
+    leaves, structure = jax.tree.flatten(getattr(states[member], field))
+    place = next(i for i, leaf in enumerate(leaves) if leaf.dtype == np.float32)
+    leaves[place] = leaves[place].at[(0,) * leaves[place].ndim].set(value)
+    part = jax.tree.unflatten(structure, leaves)
+    states[member] = states[member]._replace(**{field: part})
+
+
+def at_step(trainer: Trainer, step: int, do: Callable[[], object]) -> None:
+    """Do something when the run has made so many steps."""
+    tick = trainer.ensemble.tick
+
+    def tick_and_do() -> Any:
+        selection = tick()
+        if trainer.progress.step == step:
+            do()
+        return selection
+
+    trainer.ensemble.tick = tick_and_do
+
+
+PARTS = ("actor", "critic", "target_critic", "actor_optimizer", "critic_optimizer")
+
+
+FAULTY = [*((part, np.nan) for part in PARTS), ("critic", np.inf)]
+
+
+@pytest.mark.parametrize(("part", "value"), FAULTY)
+def test_fault_in_a_weight(part: str, value: float, tmp_path: Path, disarmed: None) -> None:
+    """Found within a few steps, named, and never in a file."""
+    trainer = late(tmp_path)
+    at_step(trainer, 600, lambda: poison(trainer, part, 1, value))
+    with pytest.raises(TrainingError, match=r"member 1, step 6(0\d|1\d): ") as fault:
+        run_to_end(trainer)
+    assert "\n" not in str(fault.value)
+    arrays, _ = storage.read(trainer.directory.state_file, "checkpoint")
+    assert all(np.isfinite(array).all() for array in arrays.values())
+    assert 0 < saved_step(trainer.directory) <= 600
+
+
+def test_fault_in_a_loss(
+    whole: RunDirectory, tmp_path: Path, disarmed: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss is named, with its member; the run goes on from before it, exactly."""
+    trainer = late(tmp_path / "faulty")
+    population = trainer.ensemble.population
+    update = population.update
+
+    def broken(state: Any, member: int, *rest: Any) -> Any:
+        result = update(state, member, *rest)
+        losses = np.array(result.losses)
+        if trainer.progress.step == 600 and member == 1:
+            losses[0] = np.inf
+        return result._replace(losses=losses)
+
+    monkeypatch.setattr(population, "update", broken)
+    with pytest.raises(TrainingError, match=r"^member 1, step 600: actor_loss is inf"):
+        run_to_end(trainer)
+    resumed = run_to_end(Trainer.resume(trainer.directory.path))
+    assert_same(whole, resumed)

@@ -1,0 +1,146 @@
+"""A run that is stopped and resumed equals the run that never stopped, bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import TINY, assert_same, run_to_end
+from pacesetter.replay import buffer
+from pacesetter.training.trainer import Trainer
+
+MODELS = {"model_hidden": (8,), "head_hidden": (8,), "critic_members": 2}
+CASES = {
+    "td3": {"env": "HalfCheetah-v5"},
+    "multi-td3": {"env": "HalfCheetah-v5", "steps": 3_300},
+    "multi-ant": {"env": "Ant-v5", "algorithm": "multi-td3", "members": 3},
+    "wrapped": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_size": 300},
+    "ou": {"env": "Hopper-v5", "algorithm": "ddpg", "exploration": "ou", "members": 2},
+    "normalized": {"env": "Walker2d-v5", "algorithm": "multi-td3", "normalize_observation": True},
+    "trials": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "select_on": "eval",
+        "select_every": 500,
+    },
+    "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
+    "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
+    "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
+    "parameter": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "exploration": "parameter",
+        "actor_layer_norm": True,
+        "copy": "actor",
+    },
+    "quantiles": {"env": "Hopper-v5", "algorithm": "multi-sac", "quantiles": 5},
+    "crossq": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-crossq",
+        "critic_hidden": (16, 16),
+        "renorm_after": 100,
+    },
+    "sunrise": {"env": "Hopper-v5", "algorithm": "sunrise", "ensemble": 3},
+    "one-of-sunrise": {  # its random learner of an episode, and blocks of updates
+        "env": "Hopper-v5",
+        "algorithm": "multi-sunrise-td3",
+        "ensemble": 3,
+        "reference": "official",
+        "ucb": 0,
+        "update_every": 50,
+    },
+    "prioritized": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "replay": "prioritized",
+        "replay_size": 300,
+    },
+    "lap": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-sac",
+        "replay": "lap",
+        "n_step": 3,
+        "replay_scope": "member",
+    },
+    "return": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "replay": "return",
+        "replay_size": 300,
+        "n_step": 4,
+    },
+    "to-go": {
+        "env": "Hopper-v5",
+        "replay": "return",
+        "replay_to_go": True,
+        "replay_importance": 0.5,
+        "replay_size": 400,
+    },
+    "assessed": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "assess": 3,
+        "assess_after": 200,
+        "normalize_observation": True,
+    },
+    "steve": {"env": "Hopper-v5", "algorithm": "multi-steve", "copy": "weights", **MODELS},
+    "steve-td3": {"env": "Hopper-v5", "algorithm": "multi-steve-td3", **MODELS},
+    "own-replays": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_scope": "member"},
+    "bf16": {"env": "Hopper-v5", "precision": "bf16", "hidden": (64, 64), "batch_size": 64},
+}
+
+
+def start(case: str, runs: Path, name: str) -> Trainer:
+    settings = {**TINY, "steps": 1_500, "algorithm": "td3", "name": name, **CASES[case]}
+    return Trainer(settings.pop("algorithm"), settings.pop("env"), runs=runs, **settings)
+
+
+def stop_at(trainer: Trainer, tick: int) -> None:
+    """Run until a tick has passed, then end as a signal would."""
+    once = trainer.ensemble.tick
+
+    def tick_and_stop() -> object:
+        selection = once()
+        if trainer.progress.tick >= tick:
+            trainer.stop()
+        return selection
+
+    trainer.ensemble.tick = tick_and_stop
+    run_to_end(trainer)
+
+
+def test_killed_before_the_first_checkpoint(runs: Path) -> None:
+    """Nothing is lost: the run starts again, and says so."""
+    whole = run_to_end(start("own-replays", runs, "whole"))
+    begun = start("own-replays", runs, "begun")
+    begun.close()
+    begun.directory.state_file.unlink()
+    resumed = Trainer.resume(begun.directory.path)
+    assert resumed.notes == ["no checkpoint yet, starting from the beginning"]
+    assert_same(whole, run_to_end(resumed))
+
+
+SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
+SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
+SLOW += ("bf16", "steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow if c in SLOW else ()) for c in CASES]
+)
+def test_stopped_anywhere_equals_uninterrupted(
+    case: str, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Small blocks, so that the ring of the `wrapped` case really goes round several times.
+    monkeypatch.setattr(buffer, "BLOCK", 64)
+    monkeypatch.setattr(buffer, "UNCOMMITTED", 150)
+    monkeypatch.setattr(buffer, "SLACK", 2 * (150 + 3) + 64)
+    whole = run_to_end(start(case, runs, "whole"))
+    stopped = start(case, runs, "stopped")
+    ticks = np.sort(np.random.default_rng(len(case)).choice(450, size=2, replace=False))
+    for tick in ticks:
+        stop_at(stopped, int(tick))
+        assert not stopped.finished
+        stopped = Trainer.resume(stopped.directory.path)
+        assert stopped.notes == []
+    assert_same(whole, run_to_end(stopped))
