@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.config import settle
 from pacesetter.learner.compiled import Population
 from pacesetter.replay.buffer import Columns
@@ -97,7 +97,7 @@ def whole(
     hyper = config.hyper
     population = Population(algorithm, columns, 0, hyper.normalize_observation, hyper.precision)
     states = population.init(members, same=False)
-    size = (algorithm.cycle, config.hyper.batch_size, columns.width)
+    size = (algorithm.updates_per_call, config.hyper.batch_size, columns.width)
     rows = np.random.default_rng(0).normal(size=size).astype(np.float32)
     still = np.zeros(spec.observation_size, np.float32), np.ones(spec.observation_size, np.float32)
     batch = columns.unpack(jnp.asarray(rows), None)
@@ -116,7 +116,7 @@ def whole(
         states[:] = run(one, states, range(members))
         return states
 
-    return call, counts, algorithm.cycle * members
+    return call, counts, algorithm.updates_per_call * members
 
 
 def main() -> None:

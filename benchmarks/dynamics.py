@@ -20,13 +20,14 @@ import numpy as np
 from tabulate import tabulate
 
 from pacesetter import policy
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.dynamics import fit as fitting
 from pacesetter.dynamics.model import Dynamics, Models
 from pacesetter.envs import Environment
-from pacesetter.policy import Floats, Policy
+from pacesetter.policy import Policy
 from pacesetter.seeding import Stream
+from pacesetter.types import Floats
 
 TARGET = 0.1
 HELD = 5  # steps that a random action is held
@@ -84,7 +85,7 @@ def by_minibatches(dynamics: Dynamics, rows: Batch, key: Any) -> Models:
         models, moments, _ = dynamics.step(dynamics.observe(models, batch), moments, batch)
         return (models, moments), None
 
-    start = models, dynamics.init_optimizer(models)
+    start = models, dynamics.init_opt_state(models)
     (models, _), _ = jax.lax.scan(step, start, jax.random.split(key, count))
     return models
 

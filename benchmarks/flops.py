@@ -14,7 +14,7 @@ import numpy as np
 from tabulate import tabulate
 
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.envs import Environment
 from pacesetter.replay.buffer import Columns
 from pacesetter.seeding import Stream
@@ -38,14 +38,14 @@ def megaflops(name: str, spec: Spec, **settings: Any) -> float:
     learner = kind.build(spec, hyper)
     masks = len(learner.mask(np.random.default_rng()))
     columns, key = Columns(*spec, masks), jax.random.key(0)
-    rows = np.zeros((learner.cycle, hyper.batch_size, columns.width), np.float32)
+    rows = np.zeros((learner.updates_per_call, hyper.batch_size, columns.width), np.float32)
 
     def update(state: Any, rows: Any) -> Any:
         return learner.update(state, columns.unpack(rows, None), key)
 
     compiled = jax.jit(update).lower(jax.eval_shape(learner.init, key), rows).compile()
     analysis: Any = compiled.cost_analysis()
-    return analysis["flops"] / 1e6 / learner.cycle
+    return analysis["flops"] / 1e6 / learner.updates_per_call
 
 
 def spec_of(env: str) -> Spec:

@@ -21,7 +21,7 @@ from ceiling import TOGETHER, alone, flops, timed, whole
 from tabulate import tabulate
 
 from pacesetter import Trainer
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.replay.buffer import Columns, Replay
 
 matplotlib.use("Agg")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.config import settle
 from pacesetter.learner.backend import IN_PLACE, compiler_options, prepare
 from pacesetter.learner.compiled import Population
@@ -31,12 +31,12 @@ def costs(name: str) -> dict[str, float]:
     columns = Columns(*HALF_CHEETAH)
     population = Population(algorithm, columns, 0, normalize=False)
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
-    rows = jax.ShapeDtypeStruct((algorithm.cycle, 256, columns.width), np.float32)
+    rows = jax.ShapeDtypeStruct((algorithm.updates_per_call, 256, columns.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
     key = np.zeros(2, np.uint32)
     lowered = population._update.lower(state, rows, None, still, {}, key)
     found: Any = lowered.compile().cost_analysis()
-    return {key: found[key] / algorithm.cycle for key in ("flops", "bytes accessed")}
+    return {key: found[key] / algorithm.updates_per_call for key in ("flops", "bytes accessed")}
 
 
 @pytest.mark.parametrize(("name", "megabytes"), [("td3", 36), ("sac", 52)])

@@ -18,8 +18,9 @@ from pacesetter.envs import make
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.networks import mlp
-from pacesetter.policy import Actors, Layers, Policy, load, unstack
+from pacesetter.policy import Actors, Policy, load, unstack
 from pacesetter.training.trainer import Trainer
+from pacesetter.types import Layers
 
 PROBE = "broken_envs:Probe-v0"
 

@@ -70,7 +70,7 @@ class Run:
     )
     count_selection_steps: bool = Field(True, description="extra episodes are part of --steps")
     copy: Literal["full", "weights", "actor"] = Field(
-        "full", description="networks and optimiser, networks alone, or the actor alone"
+        "full", description="networks and optimiser, networks single_member, or the actor alone"
     )
     same_init: bool = Field(False, description="members start from the same weights")
     count: Literal["all", "member"] = Field(
@@ -133,7 +133,9 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
         base, layers = preset_layers(name.removeprefix("multi-"), env)
         return base, [*layers, {"members": 2, "rule": "best"}]
     if name not in algorithms.names() and ":" not in name:
-        multi = [f"multi-{base}" for base in algorithms.names() if not algorithms.alone(base)]
+        multi = [
+            f"multi-{base}" for base in algorithms.names() if not algorithms.single_member(base)
+        ]
         raise unknown("algorithm", name, {*algorithms.names(), *known, *multi})
     return name, []
 

@@ -12,8 +12,9 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from pacesetter.errors import TrainingError, UsageError, unknown
-from pacesetter.policy import Floats, to_env
+from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
+from pacesetter.types import Floats
 
 LONGEST = 100_000  # steps of an episode; one that never ends would hang every evaluation
 LARGEST = float(np.finfo(np.float32).max)  # of a reward, which the replay keeps in float32

@@ -9,8 +9,9 @@ import numpy as np
 
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
-from pacesetter.policy import Floats, Policy
+from pacesetter.policy import Policy
 from pacesetter.seeding import Stream, generator
+from pacesetter.types import Floats
 
 Act = Callable[[Floats], Floats]
 

@@ -1,20 +1,17 @@
 """A trained policy as one small file, and what it does in NumPy alone: no JAX, no training code."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pacesetter import storage
 from pacesetter.errors import UsageError
+from pacesetter.types import Floats, Layers, Shape
 
-Floats = NDArray[np.float32]
-Shape = tuple[int, ...]
-Layers = Sequence[dict[str, Floats]]
 KIND = "policy"
 SCHEMA = 1
 LAYERS = ({"kernel", "bias"}, {"kernel", "bias", "scale", "offset"})

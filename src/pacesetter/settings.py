@@ -61,6 +61,12 @@ def _has_weights(value: object, info: ValidationInfo) -> object:
     return value
 
 
+def _have_one_loss(quantiles: int, info: ValidationInfo) -> int:
+    if quantiles and info.data.get("replay") == "lap":
+        raise ValueError("have a loss of their own, as has --replay lap; allowed with it: 0")
+    return quantiles
+
+
 def _assessed(value: int | None, info: ValidationInfo) -> int | None:
     if value is not None and not info.data.get("assess"):
         raise ValueError("is a setting of --assess, which is off")
@@ -176,6 +182,29 @@ class OffPolicy(Hyper):
         if self.replay_importance is not None:
             importance = self.replay_importance
         return exponent, importance
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class ActorCritic(OffPolicy):
+    """Settings of every learner with an actor, several critics and their slowly moving targets."""
+
+    hidden: tuple[Width, ...] = Field(
+        (256, 256), min_length=1, description="widths of hidden layers"
+    )
+    actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step size of the actor")
+    critic_learning_rate: LearningRate = Field(
+        3e-4, gt=0, description="Adam step size of the critics"
+    )
+    tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
+    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
+    critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
+    actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
+    quantiles: Annotated[int, AfterValidator(_have_one_loss)] = Field(
+        0,
+        ge=0,
+        le=1_000,
+        description="quantiles that a critic learns, usually 25; 0 learns the mean alone",
+    )
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)

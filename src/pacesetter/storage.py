@@ -13,8 +13,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from pacesetter.errors import UsageError
+from pacesetter.types import Arrays
 
-Arrays = dict[str, NDArray[Any]]
 TEMPORARY = ".pacesetter-tmp"
 
 

@@ -9,7 +9,7 @@ from numeric import KEY, member, perceptron, quantile_loss, random_batch, random
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import sac, td3
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.networks import critic_heads
 from pacesetter.settings import STRICT
 

@@ -10,7 +10,7 @@ from numeric import KEY, close, member, perceptron, random_batch, random_state, 
 
 from conftest import TINY, run_to_end
 from pacesetter.algorithms import crossq
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.config import settle
 from pacesetter.networks import batch_renorm
 from pacesetter.policy import Policy, unstack
@@ -161,7 +161,7 @@ def test_an_update_equals_a_reference_in_numpy(warm: bool, rng: np.random.Genera
         def critic_loss(network: Any, forward: Pass = forward) -> float:
             return float((batch.weight * (forward(network, joint)[:8, 0] - y) ** 2).mean())
 
-        close(member(new.critic_optimizer[0].mu, i), halved(slopes(critic_loss, critic)))
+        close(member(new.critic_opt_state[0].mu, i), halved(slopes(critic_loss, critic)))
         for layer, moved in zip(member(new.critic, i), forward.moved, strict=True):
             close({name: layer[name] for name in moved}, moved)
     np.testing.assert_allclose(update.error[0], np.abs(said[:, :8] - y).max(axis=0))
@@ -174,11 +174,11 @@ def test_an_update_equals_a_reference_in_numpy(warm: bool, rng: np.random.Genera
         values = [evaluate(member(new.critic, i), inputs)[:, 0] for i in range(2)]
         return float((log_prob - np.min(values, axis=0)).mean())
 
-    close(new.actor_optimizer[0].mu, halved(slopes(actor_loss, old.actor)))
+    close(new.actor_opt_state[0].mu, halved(slopes(actor_loss, old.actor)))
     for layer, moved in zip(new.actor, forward.moved, strict=True):
         close({name: layer[name] for name in moved}, moved)
     _, log_prob = squashed(forward(old.actor, batch.observation), current)
-    assert new.alpha_optimizer[0].mu == pytest.approx(0.1 * (2 - log_prob.mean()))
+    assert new.alpha_opt_state[0].mu == pytest.approx(0.1 * (2 - log_prob.mean()))
 
 
 def halved(tree: Any) -> Any:
@@ -208,9 +208,9 @@ def test_actor_moves_once_in_three(rng: np.random.Generator) -> None:
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, 3, 8))
     update = jax.jit(algorithm.update)(state, batch, KEY)
     assert update.error.shape == (3, 8)
-    counts = [update.state.critic_optimizer, update.state.actor_optimizer]
+    counts = [update.state.critic_opt_state, update.state.actor_opt_state]
     assert [int(adam[0].count) for adam in counts] == [3, 1]
-    assert (int(update.state.alpha_optimizer[0].count), int(update.state.updates)) == (1, 3)
+    assert (int(update.state.alpha_opt_state[0].count), int(update.state.updates)) == (1, 3)
 
 
 def test_renorm_follows_the_networks_own_updates(rng: np.random.Generator) -> None:
@@ -222,7 +222,7 @@ def test_renorm_follows_the_networks_own_updates(rng: np.random.Generator) -> No
     for i in range(3):
         one = steps[0](one, batch, jax.random.key(i)).state
         other = steps[1](other, batch, jax.random.key(i)).state
-        moments = [(s.actor_optimizer[0].mu, s.critic_optimizer[0].mu) for s in (one, other)]
+        moments = [(s.actor_opt_state[0].mu, s.critic_opt_state[0].mu) for s in (one, other)]
         pairs = zip(*map(jax.tree.leaves, moments), strict=True)
         equal = [np.array_equal(a, b) for a, b in pairs if np.any(a != 0)]
         assert all(equal) if i < 2 else not any(equal)

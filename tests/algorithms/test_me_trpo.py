@@ -15,7 +15,7 @@ from test_resume import stop_at
 from conftest import assert_same, log, run_to_end
 from pacesetter import config
 from pacesetter.algorithms import me_trpo, trpo
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 from pacesetter.cli.main import main
 from pacesetter.config import settle
 from pacesetter.dynamics.model import Known, Models

@@ -22,7 +22,7 @@ from numeric import (
 
 from conftest import TINY, run_to_end
 from pacesetter.algorithms import sac
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.networks import mlp
 from pacesetter.policy import Policy, unstack
 from pacesetter.training.trainer import Trainer
@@ -146,7 +146,7 @@ def test_an_update_equals_a_reference_in_numpy(case: str, rng: np.random.Generat
     for i in range(2):
         critic = member(old.critic, i)
         loss = partial(reference.critic_loss, y)
-        close(member(new.critic_optimizer[0].mu, i), scaled(slopes(loss, critic), 0.1))
+        close(member(new.critic_opt_state[0].mu, i), scaled(slopes(loss, critic), 0.1))
         losses.append(loss(critic))
         values = reference._say(critic, reference.batch.action).mean(axis=-1)
         errors.append(np.abs(values - y.mean(axis=-1)))
@@ -154,7 +154,7 @@ def test_an_update_equals_a_reference_in_numpy(case: str, rng: np.random.Generat
     np.testing.assert_allclose(update.error[0], np.max(errors, axis=0))
     moved = old._replace(critic=new.critic)
     actor_loss = partial(reference.actor_loss, moved)
-    close(new.actor_optimizer[0].mu, scaled(slopes(actor_loss, old.actor), 0.1))
+    close(new.actor_opt_state[0].mu, scaled(slopes(actor_loss, old.actor), 0.1))
     assert update.losses["actor_loss"] == pytest.approx(actor_loss(old.actor))
     for part in ("actor", "critic"):  # the first Adam step is the rate in the gradient's direction
         rate = getattr(hyper, f"{part}_learning_rate")
@@ -167,7 +167,7 @@ def test_an_update_equals_a_reference_in_numpy(case: str, rng: np.random.Generat
     close(new.target_critic, soft)
     wanted = -2 if hyper.target_entropy is None else hyper.target_entropy
     excess = reference.entropy(old.actor) - wanted
-    assert new.alpha_optimizer[0].mu == pytest.approx(0.1 * excess)
+    assert new.alpha_opt_state[0].mu == pytest.approx(0.1 * excess)
     assert new.log_alpha == pytest.approx(old.log_alpha - 3e-4 * np.sign(excess))
     assert update.losses["alpha"] == pytest.approx(hyper.initial_alpha)
     assert new.updates == 1
@@ -225,7 +225,7 @@ def test_exploring_action_is_the_learners_own(rng: np.random.Generator) -> None:
     observation = rng.normal(size=3).astype(np.float32)
     mean, log_std = np.split(np.asarray(mlp.apply(state.actor, observation)), 2)
     ours, theirs = np.random.default_rng(5), np.random.default_rng(5)
-    memory = algorithm.begin(state.actor, ours)
+    memory = algorithm.start_episode(state.actor, ours)
     for _ in range(3):
         action, memory = algorithm.act(state.actor, memory, observation, ours)
         noise = theirs.standard_normal(2, np.float32)

@@ -12,9 +12,9 @@ import pytest
 
 from conftest import TINY, run_to_end
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Batch, Spec
 from pacesetter.algorithms.steve import STEVE, combine
 from pacesetter.algorithms.td3 import State
+from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.dynamics.model import Dynamics, Known, Models
 from pacesetter.errors import UsageError
@@ -185,7 +185,7 @@ def test_a_perfect_linear_model_gives_the_n_step_return() -> None:
 
 
 def assert_equal_networks(ours: Any, theirs: Any) -> None:
-    for part in (*NETWORKS, "actor_optimizer", "critic_optimizer", "updates"):
+    for part in (*NETWORKS, "actor_opt_state", "critic_opt_state", "updates"):
         assert same(getattr(ours, part), getattr(theirs, part)), part
 
 
@@ -198,7 +198,7 @@ def test_without_horizon_it_is_its_base(name: str, base: str) -> None:
     ours = new(steve)
     theirs = State(**{part: getattr(ours, part) for part in State._fields})
     for cycle in range(5):
-        batch, key = rows(plain.cycle, 16, seed=cycle), jax.random.key(cycle)
+        batch, key = rows(plain.updates_per_call, 16, seed=cycle), jax.random.key(cycle)
         mine, other = update(ours, batch, key), plain_update(theirs, batch, key)
         ours, theirs = mine.state, other.state
         assert_equal_networks(ours, theirs)
@@ -313,13 +313,13 @@ def test_copies_of_members(copy: str) -> None:
     algorithm = learner("steve", batch_size=16, **SMALL)
     states = [new(algorithm, seed) for seed in (0, 1)]
     states[1] = states[1]._replace(
-        models_optimizer=jax.tree.map(lambda x: x + 1, states[1].models_optimizer)
+        models_opt_state=jax.tree.map(lambda x: x + 1, states[1].models_opt_state)
     )
     _, copied = inherit(states, np.array([0, 0]), copy)
     assert same(copied.actor, states[0].actor)
     assert same(copied.models, states[1 if copy == "actor" else 0].models)
-    own = states[0 if copy == "full" else 1].models_optimizer
-    assert same(copied.models_optimizer, own)
+    own = states[0 if copy == "full" else 1].models_opt_state
+    assert same(copied.models_opt_state, own)
 
 
 def test_no_key_is_used_twice() -> None:

@@ -12,7 +12,7 @@ import pytest
 from conftest import TINY, run_to_end
 from pacesetter import algorithms
 from pacesetter.algorithms import sunrise
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.ensemble import members
 from pacesetter.errors import UsageError
@@ -101,7 +101,7 @@ def test_an_ensemble_of_one_is_its_base(name: str) -> None:
         alone = member(state, 0)
         for cycle in range(3):
             key = jax.random.key(cycle)
-            batch = double(minibatches(base.cycle, 16, np.ones((16, 1)), seed=cycle))
+            batch = double(minibatches(base.updates_per_call, 16, np.ones((16, 1)), seed=cycle))
             found = update(ours, state, batch, key)
             expected = update(base, alone, batch, key)
             state, alone = found.state, expected.state
@@ -110,7 +110,7 @@ def test_an_ensemble_of_one_is_its_base(name: str) -> None:
             np.testing.assert_allclose(found.error, expected.error, rtol=1e-11)
             for loss, value in expected.losses.items():
                 np.testing.assert_allclose(found.losses[loss], value, rtol=1e-11)
-    assert np.all(leaves(state.updates)[0] == 3 * base.cycle)
+    assert np.all(leaves(state.updates)[0] == 3 * base.updates_per_call)
 
 
 @both
@@ -134,7 +134,7 @@ def test_official_gradients_are_a_row_short(name: str) -> None:
     with jax.enable_x64(True):
         state = double(begin(ours))
         batch = double(minibatches(1, 256, np.ones((256, 1))))
-        batch = jax.tree.map(lambda x: np.repeat(x, base.cycle, axis=0), batch)
+        batch = jax.tree.map(lambda x: np.repeat(x, base.updates_per_call, axis=0), batch)
         found = update(ours, state, batch, KEY).state
         alone = update(base, member(state, 0), batch, KEY).state
         moments = [field for field in found._fields if field.endswith("_optimizer")]
@@ -160,7 +160,7 @@ def test_a_learner_without_rows_stands_still(name: str, reference: Any) -> None:
     """Its gradients are exactly 0, of critics, actor and temperature; nothing is NaN."""
     ours = learner(name, ensemble=3, reference=reference)
     state = begin(ours)
-    batch = minibatches(ours.cycle, 16, np.tile([1, 0, 1], (16, 1)))
+    batch = minibatches(ours.updates_per_call, 16, np.tile([1, 0, 1], (16, 1)))
     new = update(ours, state, batch, KEY).state
     assert all(np.isfinite(leaf).all() for leaf in leaves(new))
     for field in (field for field in new._fields if field.endswith("_optimizer")):
@@ -182,12 +182,12 @@ def test_masked_rows_mean_nothing(name: str, reference: Any) -> None:
     ours = learner(name, ensemble=2, reference=reference)
     mask = np.ones((16, 2))
     mask[5:9, 0] = 0
-    batch = minibatches(ours.cycle, 16, mask)
+    batch = minibatches(ours.updates_per_call, 16, mask)
     other = jax.tree.map(np.copy, batch)
     other.reward[:, 5:9] += 3
     other.action[:, 5:9] *= -1
     one, two = (update(ours, begin(ours), rows, KEY).state for rows in (batch, other))
-    moments = [firsts(state.critic_optimizer) for state in (one, two)]
+    moments = [firsts(state.critic_opt_state) for state in (one, two)]
     for a, b in zip(*moments, strict=True):
         np.testing.assert_array_equal(a[0], b[0])
         assert np.any(a[1] != b[1])
@@ -285,7 +285,7 @@ def test_a_weight_scales_the_gradient_of_its_row(name: str) -> None:
     weight = np.asarray(sunrise.backup_weight(deviation, 20.0))[:, 0]
     assert np.all(weight < 0.999)
     pairs = zip(
-        firsts(weighed.state.critic_optimizer), firsts(plain.state.critic_optimizer), strict=True
+        firsts(weighed.state.critic_opt_state), firsts(plain.state.critic_opt_state), strict=True
     )
     for one, other in pairs:
         shape = (2,) + (1,) * (other.ndim - 1)
@@ -366,8 +366,8 @@ def test_the_best_bound_by_loops(name: str, reference: Any, rng: np.random.Gener
     noise = {"exploration_noise": 0.4} if name == "sunrise-td3" else {}
     ours = learner(name, ensemble=size, reference=reference, ucb=2.0, **noise)
     state = begin(ours)
-    acting = jax.device_get(ours.acting(state))
-    memory = ours.begin(acting, rng)
+    acting = jax.device_get(ours.policy_params(state))
+    memory = ours.start_episode(acting, rng)
     winners = set()
     for step in range(30):
         observation = rng.normal(size=3).astype(np.float32)
@@ -398,11 +398,11 @@ def test_official_without_lambda_follows_one_learner(name: str, rng: np.random.G
     noise = {"exploration_noise": 0.4} if name == "sunrise-td3" else {}
     ours = learner(name, ensemble=3, reference="official", ucb=0, **noise)
     state = begin(ours)
-    acting = jax.device_get(ours.acting(state))
+    acting = jax.device_get(ours.policy_params(state))
     assert not acting.critic
     chosen = []
     for episode in range(300):
-        memory = ours.begin(acting, rng)
+        memory = ours.start_episode(acting, rng)
         chosen.append(int(memory[1]))
         for step in range(2 if episode < 5 else 0):
             observation = rng.normal(size=3).astype(np.float32)
@@ -531,7 +531,7 @@ def test_other_noise_is_refused() -> None:
 @both
 def test_an_ensemble_uses_no_key_twice(name: str) -> None:
     ours = learner(name, ensemble=2)
-    batch = minibatches(ours.cycle, 8, np.ones((8, 2)))
+    batch = minibatches(ours.updates_per_call, 8, np.ones((8, 2)))
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(ours.init), KEY)
         jax.eval_shape(jax.jit(ours.update), state, batch, KEY)

@@ -11,8 +11,8 @@ import pytest
 
 from conftest import TINY, run_to_end
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Batch, Spec
 from pacesetter.algorithms.td3 import TD3, State
+from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.evaluation import evaluate
 from pacesetter.networks import mlp
@@ -219,8 +219,8 @@ def test_actor_and_targets_move_once_a_cycle(delay: int, minibatches: Minibatche
             jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-7), after, expected)
             assert all_differ(before, after)
     assert state.updates == 5 * delay
-    assert optimizer_count(state.actor_optimizer) == 5
-    assert optimizer_count(state.critic_optimizer) == 5 * delay
+    assert optimizer_count(state.actor_opt_state) == 5
+    assert optimizer_count(state.critic_opt_state) == 5 * delay
 
 
 def optimizer_count(moments: Any) -> int:
@@ -250,7 +250,7 @@ def test_fitting_the_actor_leaves_the_critics(minibatches: Minibatches) -> None:
     algorithm = learner()
     old = fresh(algorithm)
     new, _ = fit_actor(algorithm, old, minibatches(16))
-    for part in ("critic", "critic_optimizer", "updates"):
+    for part in ("critic", "critic_opt_state", "updates"):
         assert same(getattr(old, part), getattr(new, part))
     assert all_differ(old.actor, new.actor)
 
@@ -260,7 +260,7 @@ def test_fitting_the_critics_leaves_the_rest(minibatches: Minibatches) -> None:
     algorithm, batch = learner(), minibatches(16)
     old = fresh(algorithm)
     new, *_ = fit_critic(algorithm, old, batch, batch.reward, batch.weight)
-    for part in ("actor", "actor_optimizer", "target_actor", "target_critic"):
+    for part in ("actor", "actor_opt_state", "target_actor", "target_critic"):
         assert same(getattr(old, part), getattr(new, part))
     assert all_differ(old.critic, new.critic)
 
@@ -277,7 +277,7 @@ def test_a_critic_learns_nothing_from_its_twin(kept: int, minibatches: Minibatch
     two, *_ = fit_critic(algorithm, state, batch, batch.reward, batch.weight)
     assert same(member(one.critic, kept), member(two.critic, kept))
     assert all_differ(member(one.critic, 1 - kept), member(two.critic, 1 - kept))
-    moments = [[x[kept] for x in jax.tree.leaves(s.critic_optimizer) if x.ndim] for s in (one, two)]
+    moments = [[x[kept] for x in jax.tree.leaves(s.critic_opt_state) if x.ndim] for s in (one, two)]
     assert same(*moments)
 
 
@@ -442,7 +442,7 @@ def plain(network: Any) -> Nets:
 
 def smoothing_noise(algorithm: TD3, batch: Batch, key: Any) -> list[Any]:
     """The unclipped noise that `update` draws with this key."""
-    keys = jax.random.split(key, algorithm.cycle)
+    keys = jax.random.split(key, algorithm.updates_per_call)
     draws = [jax.random.normal(k, batch.action.shape[1:], batch.action.dtype) for k in keys]
     return [algorithm.hyper.target_noise * np.asarray(draw, np.float64) for draw in draws]
 
@@ -468,7 +468,7 @@ def cycles_agree(case: str, dtype: Any, make: Minibatches, rtol: float, atol: fl
     state = jax.tree.map(cast, fresh(algorithm))
     reference = Reference(algorithm, state)
     for cycle in range(3):
-        batch, key = jax.tree.map(cast, make(algorithm.cycle, 16)), jax.random.key(cycle)
+        batch, key = jax.tree.map(cast, make(algorithm.updates_per_call, 16)), jax.random.key(cycle)
         state = update(algorithm, state, batch, key).state
         reference.update(batch, smoothing_noise(algorithm, batch, key))
         for part, networks in reference.parts().items():
@@ -542,7 +542,7 @@ def noise_of(kind: str, scale: float, steps: int, size: int) -> Any:
     algorithm = learner(spec=Spec(3, size), exploration=kind, exploration_noise=scale)
     rng, observation = np.random.default_rng(1), np.zeros(3, np.float32)
     acting = constant(fresh(algorithm).actor, 0)
-    memory = algorithm.begin(acting, rng)
+    memory = algorithm.start_episode(acting, rng)
     actions: list[Any] = []
     for _ in range(steps):
         action, memory = algorithm.act(acting, memory, observation, rng)
@@ -645,7 +645,7 @@ def test_policy_file_acts_as_the_learner(
     np.testing.assert_allclose(loaded.act(observations), expected, rtol=0, atol=1e-6)
     in_env = low + (high - low) * (expected + 1) / 2
     np.testing.assert_allclose(loaded(observations), in_env, rtol=0, atol=5e-6)
-    acting = jax.device_get(algorithm.acting(state))
+    acting = jax.device_get(algorithm.policy_params(state))
     for x, action in zip(scaled, expected, strict=True):
         found, _ = algorithm.act(acting, (), x, rng)
         np.testing.assert_allclose(found, action, rtol=0, atol=1e-6)
@@ -655,7 +655,7 @@ def test_policy_file_acts_as_the_learner(
 def test_a_learner_uses_no_key_twice(name: str, minibatches: Minibatches) -> None:
     """JAX's check of key reuse passes whatever it traces, and would refuse a reused one."""
     algorithm = learner(name)
-    state, batch = fresh(algorithm), minibatches(algorithm.cycle, 16)
+    state, batch = fresh(algorithm), minibatches(algorithm.updates_per_call, 16)
 
     def reuse(key: Any) -> Any:
         return algorithm.update(state, batch, key), jax.random.normal(key, (2,))

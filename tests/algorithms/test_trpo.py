@@ -16,7 +16,8 @@ from test_resume import stop_at
 from conftest import assert_same, log, run_to_end
 from pacesetter import storage
 from pacesetter.algorithms import trpo
-from pacesetter.algorithms.contract import Batch, Spec, Update
+from pacesetter.algorithms.contract import Update
+from pacesetter.batch import Batch, Spec
 from pacesetter.cli.main import main
 from pacesetter.config import settle
 from pacesetter.errors import TrainingError, UsageError

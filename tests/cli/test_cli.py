@@ -18,7 +18,7 @@ import pytest
 from conftest import TINY, assert_same, run_to_end
 from pacesetter import algorithms, config
 from pacesetter.algorithms import ddpg
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.cli.flags import split_env_kwargs
 from pacesetter.cli.main import VERBS, main
 from pacesetter.config import Run, settle

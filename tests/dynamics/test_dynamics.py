@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 from pacesetter.dynamics import fit as fitting
 from pacesetter.dynamics.model import (
     DETERMINISTIC,
@@ -229,7 +229,7 @@ def test_members_begin_apart_and_learn_from_their_own_rows() -> None:
     step = jax.jit(SMALL.step)
     mine, others = stacked(rows(16)), stacked(rows(16))
     jax.tree.map(lambda x, new: x.__setitem__(1, new), others, rows(16, seed=1))
-    moments = SMALL.init_optimizer(models)
+    moments = SMALL.init_opt_state(models)
     one, two = (step(models, moments, batch)[0].networks for batch in (mine, others))
     assert same(member(one, 0), member(two, 0))
     assert not same(member(one, 1), member(two, 1))
@@ -279,7 +279,7 @@ def test_each_member_ends_at_its_own_best(patience: int) -> None:
     models = models._replace(scale=fitting.measure(data, ~aside))
     held = stacked(jax.tree.map(lambda x: x[aside], data))
     step, check = jax.jit(TINY.step), jax.jit(TINY.losses)
-    moments = TINY.init_optimizer(models)
+    moments = TINY.init_opt_state(models)
     loss, stale, best = np.full(3, np.inf), np.zeros(3, int), [member(models.networks, 0)] * 3
     epoch = 0
     while (stale < patience).any() and epoch < 25:

@@ -121,7 +121,7 @@ def test_selection_copies_the_winner_whole(runs: Path) -> None:
         assert report.values["parents"] == [1, 1]
         assert report.values["champion"] == trainer.progress.champion == 1
         winner, after = before[1], jax.device_get(trainer.ensemble.states)
-    moments = [x for x in jax.tree.leaves(winner.critic_optimizer) if x.ndim]
+    moments = [x for x in jax.tree.leaves(winner.critic_opt_state) if x.ndim]
     assert all(np.any(x) for x in moments)
     assert winner.updates == 10
     for part in NETWORKS:
@@ -212,8 +212,8 @@ def test_copy_of_the_actor_starts_its_optimiser_anew(states: Any) -> None:
     for k, parent in [(0, 1), (2, 0)]:
         assert same(new[k].actor, states[parent].actor)
         assert same(new[k].target_actor, states[parent].actor)
-        assert not any(np.any(x) for x in jax.tree.leaves(new[k].actor_optimizer))
-        for part in ("critic", "target_critic", "critic_optimizer", "updates"):
+        assert not any(np.any(x) for x in jax.tree.leaves(new[k].actor_opt_state))
+        for part in ("critic", "target_critic", "critic_opt_state", "updates"):
             assert same(getattr(new[k], part), getattr(states[k], part))
     assert same(new[1], states[1])  # the winner itself is left as it is
 

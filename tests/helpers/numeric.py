@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 
 KEY = jax.random.key(3)
 

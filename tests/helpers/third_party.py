@@ -10,10 +10,12 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms.contract import NO_MASK, Array, Update
+from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
-from pacesetter.policy import Actors, Floats, forward
+from pacesetter.policy import Actors, forward
 from pacesetter.settings import STRICT, OffPolicy, Width
+from pacesetter.types import Floats
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -30,8 +32,8 @@ class State(NamedTuple):
 
     actor: mlp.Network
     critic: mlp.Network
-    actor_optimizer: Any
-    critic_optimizer: Any
+    actor_opt_state: Any
+    critic_opt_state: Any
     updates: Array
 
 
@@ -79,8 +81,8 @@ class Plain:
             return (rows.weight * error**2).mean(), jnp.abs(error)
 
         (loss, error), slope = jax.value_and_grad(critic_loss, has_aux=True)(state.critic)
-        critic, critic_moments = mlp.descend(
-            self._adam, state.critic, slope, state.critic_optimizer
+        critic, critic_moments = mlp.apply_gradient(
+            self._adam, state.critic, slope, state.critic_opt_state
         )
 
         def actor_loss(actor: mlp.Network) -> Array:
@@ -88,7 +90,9 @@ class Plain:
             return -mlp.outputs(critic, rows.observation, action)[..., 0].mean()
 
         lack, slope = jax.value_and_grad(actor_loss)(state.actor)
-        actor, actor_moments = mlp.descend(self._adam, state.actor, slope, state.actor_optimizer)
+        actor, actor_moments = mlp.apply_gradient(
+            self._adam, state.actor, slope, state.actor_opt_state
+        )
         state = State(actor, critic, actor_moments, critic_moments, state.updates + 1)
         return Update(state, {"critic_loss": loss, "actor_loss": lack}, error[None])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pacesetter import Trainer, algorithms
-from pacesetter.algorithms.contract import Batch, Spec
+from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
 from pacesetter.errors import UsageError
 from pacesetter.learner.precision import bfloat16_products
@@ -105,7 +105,7 @@ def test_an_update_differs_by_rounding_alone(name: str) -> None:
     """Every parameter stays float32 and goes nearly the same way, but not quite."""
     algorithm = algorithms.find(name).build(Spec(17, 6), settle(name, "HalfCheetah-v5").hyper)
     shapes = {"observation": (17,), "action": (6,), "next_observation": (17,)}
-    rows = (algorithm.cycle, 64)
+    rows = (algorithm.updates_per_call, 64)
     fields = {f: RNG.normal(size=(*rows, *shapes.get(f, ()))) for f in Batch._fields}
     batch = Batch(**jax.tree.map(jnp.float32, fields))
     state, key = algorithm.init(jax.random.key(0)), jax.random.key(1)

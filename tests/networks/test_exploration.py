@@ -13,7 +13,7 @@ from numeric import KEY, perceptron, random_batch, random_state
 from conftest import TINY, run_to_end
 from pacesetter import algorithms
 from pacesetter.algorithms import td3
-from pacesetter.algorithms.contract import Spec
+from pacesetter.batch import Spec
 from pacesetter.errors import UsageError
 from pacesetter.learner.compiled import inherit
 from pacesetter.networks import exploration, mlp
@@ -100,7 +100,7 @@ def test_noise_spares_the_gains_of_layer_norm(rng: np.random.Generator) -> None:
     before = copy.deepcopy(actor)
     for noisy in (
         perturb(actor, np.float32(0.3), KEY),
-        algorithm.begin((actor, np.float32(0.3)), rng),
+        algorithm.start_episode((actor, np.float32(0.3)), rng),
     ):
         for clean, layer in zip(actor, noisy, strict=True):
             assert clean.keys() == layer.keys()
@@ -144,7 +144,7 @@ def test_learning_knows_only_the_clean_policy(name: str, rng: np.random.Generato
     """Whatever sigma is, networks, moments, losses and errors are those of gaussian noise."""
     algorithm, plain = learner(name), learner(name, exploration="gaussian")
     state = new_state(algorithm, rng)
-    batch = jax.tree.map(np.float32, random_batch(rng, SPEC, algorithm.cycle, 16))
+    batch = jax.tree.map(np.float32, random_batch(rng, SPEC, algorithm.updates_per_call, 16))
     update = jax.jit(algorithm.update)
     found = [update(state._replace(sigma=np.float32(s)), batch, KEY) for s in (1e-3, 0.9)]
     reference = jax.jit(plain.update)(state._replace(sigma=None), batch, KEY)
@@ -165,8 +165,8 @@ def test_policy_is_clean(rng: np.random.Generator) -> None:
 def test_an_episode_is_acted_by_one_noisy_actor(rng: np.random.Generator) -> None:
     """Its actions are the noisy actor's own, it does not change, and nothing else is drawn."""
     algorithm = learner()
-    acting = jax.device_get(algorithm.acting(new_state(algorithm, rng)))
-    first = memory = algorithm.begin(acting, rng)
+    acting = jax.device_get(algorithm.policy_params(new_state(algorithm, rng)))
+    first = memory = algorithm.start_episode(acting, rng)
     drawn = rng.bit_generator.state
     for _ in range(3):
         observation = np.ones(3, np.float32)
@@ -174,7 +174,7 @@ def test_an_episode_is_acted_by_one_noisy_actor(rng: np.random.Generator) -> Non
         np.testing.assert_allclose(action, np.tanh(perceptron(first, observation)), atol=1e-5)
         assert memory is first
     assert rng.bit_generator.state == drawn
-    assert not same(first, algorithm.begin(acting, rng))
+    assert not same(first, algorithm.start_episode(acting, rng))
 
 
 def test_noisy_actor_lasts_an_episode(runs: Path) -> None:
@@ -232,7 +232,7 @@ def test_stochastic_policies_explore_by_themselves(name: str, kind: str, runs: P
 
 def test_a_learner_uses_no_key_twice(rng: np.random.Generator) -> None:
     algorithm = learner()
-    batch = jax.tree.map(np.float32, random_batch(rng, SPEC, algorithm.cycle, 7))
+    batch = jax.tree.map(np.float32, random_batch(rng, SPEC, algorithm.updates_per_call, 7))
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(algorithm.init), KEY)
         jax.eval_shape(jax.jit(algorithm.update), state, batch, KEY)

@@ -319,7 +319,7 @@ def at_step(trainer: Trainer, step: int, do: Callable[[], object]) -> None:
     trainer.ensemble.tick = tick_and_do
 
 
-PARTS = ("actor", "critic", "target_critic", "actor_optimizer", "critic_optimizer")
+PARTS = ("actor", "critic", "target_critic", "actor_opt_state", "critic_opt_state")
 
 
 FAULTY = [*((part, np.nan) for part in PARTS), ("critic", np.inf)]

@@ -1,6 +1,5 @@
 """The table of algorithms: a new one is one file and one line here."""
 
-from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple
@@ -9,36 +8,29 @@ from pacesetter.errors import UsageError, unknown
 
 
 class Entry(NamedTuple):
-    """Where an algorithm is and one line of what it is."""
+    """Where an algorithm's class is and one line of what it is."""
 
     target: str
     help: str
-    alone: bool = False  # it trains one member only
+    single_member: bool = False  # it trains one member only
+
+
+def _shipped(target: str, help: str, single_member: bool = False) -> Entry:
+    return Entry(f"pacesetter.algorithms.{target}", help, single_member)
 
 
 TABLE = {
-    "td3": Entry("pacesetter.algorithms.td3", "twin delayed DDPG (Fujimoto et al. 2018)"),
-    "sac": Entry("pacesetter.algorithms.sac", "soft actor-critic, temperature learned"),
-    "crossq": Entry(
-        "pacesetter.algorithms.crossq", "SAC with batch renorm and no targets (Bhatt et al. 2024)"
-    ),
-    "sunrise": Entry(
-        "pacesetter.algorithms.sunrise", "an ensemble of SAC learners (Lee et al. 2021)"
-    ),
-    "sunrise-td3": Entry("pacesetter.algorithms.sunrise_td3", "SUNRISE's ensemble over TD3"),
-    "steve": Entry("pacesetter.algorithms.steve", "DDPG with targets from learned models"),
-    "steve-td3": Entry("pacesetter.algorithms.steve_td3", "TD3 with targets from learned models"),
-    "ddpg": Entry("pacesetter.algorithms.ddpg", "TD3 with its three tricks off"),
-    "trpo": Entry("pacesetter.algorithms.trpo", "trust region policy optimisation", True),
-    "me-trpo": Entry("pacesetter.algorithms.me_trpo", "TRPO in an ensemble of models", True),
+    "td3": _shipped("td3:TD3", "twin delayed DDPG (Fujimoto et al. 2018)"),
+    "sac": _shipped("sac:SAC", "soft actor-critic, temperature learned"),
+    "crossq": _shipped("crossq:CrossQ", "SAC with batch renorm and no targets (Bhatt et al. 2024)"),
+    "sunrise": _shipped("sunrise:Sunrise", "an ensemble of SAC learners (Lee et al. 2021)"),
+    "sunrise-td3": _shipped("sunrise_td3:SunriseTD3", "SUNRISE's ensemble over TD3"),
+    "steve": _shipped("steve:STEVE", "DDPG with targets from learned models"),
+    "steve-td3": _shipped("steve_td3:SteveTD3", "TD3 with targets from learned models"),
+    "ddpg": _shipped("ddpg:DDPG", "TD3 with its three tricks off"),
+    "trpo": _shipped("trpo:TRPO", "trust region policy optimisation", True),
+    "me-trpo": _shipped("me_trpo:METRPO", "TRPO in an ensemble of models", True),
 }
-
-
-class Kind(NamedTuple):
-    """An algorithm before it knows its task: its settings class and `build(spec, hyper)`."""
-
-    Hyper: type
-    build: Callable[..., Any]
 
 
 def plugins() -> dict[str, str]:
@@ -51,23 +43,22 @@ def names() -> list[str]:
     return [*TABLE, *plugins()]
 
 
-def alone(name: str) -> bool:
+def single_member(name: str) -> bool:
     """Whether there is no `multi-` form of an algorithm."""
-    return name in TABLE and TABLE[name].alone
+    return name in TABLE and TABLE[name].single_member
 
 
-def find(name: str) -> Kind:
-    """The algorithm by name, or by `package.module:Class` with a class attribute `Hyper`."""
+def find(name: str) -> type[Any]:
+    """The learner class by name, or by `package.module:Class`; see `contract.Learner`."""
     found = {key: entry.target for key, entry in TABLE.items()} | plugins()
     target = name if ":" in name else found.get(name)
     if target is None:
         raise unknown("algorithm", name, found)
     path, _, attribute = target.partition(":")
     try:
-        module: Any = import_module(path)
-        if not attribute:
-            return Kind(module.Hyper, module.build)
-        found_class = getattr(module, attribute)
-        return Kind(found_class.Hyper, found_class)
+        learner: Any = getattr(import_module(path), attribute)
+        if not isinstance(learner.Hyper, type):
+            raise TypeError("its attribute Hyper must be a settings class")
     except Exception as error:
         raise UsageError(f"algorithm: cannot load '{target}': {error}") from None
+    return learner

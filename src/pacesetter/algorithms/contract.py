@@ -1,104 +1,120 @@
-"""The whole contract between an algorithm and the trainer.
+"""The whole contract between a learner and the trainer.
 
-Axes: K members, U updates a cycle, B batch, T time, E environments, N networks in one learner.
+Axes: K members, U updates per call, B batch, T time, E environments, N networks in one learner.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
 import numpy as np
 
-from pacesetter.policy import Actors, Floats
+from pacesetter.batch import Batch, Spec
+from pacesetter.errors import UsageError
+from pacesetter.policy import Actors
+from pacesetter.types import Floats
 
 Array = jax.Array
-State = Any
-Memory = Any
-
-
-class Spec(NamedTuple):
-    """Sizes of the task's vectors; actions are in [-1, 1] on this side of the env border."""
-
-    observation_size: int
-    action_size: int
-
-
-class Batch(NamedTuple):
-    """What one `update` learns from: (U, B, ...) off-policy, or a rollout (T, E, ...) on-policy."""
-
-    observation: Array
-    action: Array
-    reward: Array
-    next_observation: Array
-    discount: Array  # gamma**n * (1 - terminated)
-    last: Array  # the episode ended here: terminated or truncated
-    weight: Array  # importance, 1 if drawn uniformly
-    mask: Array  # (..., N) bootstrap columns, stored with the row; N may be 0
-    starts: Array | None = None  # reset observations, for imagined rollouts
-    valid: Array | None = None  # valid rows of a padded ring
+State = Any  # a NamedTuple of arrays
+UNROLLED = 4  # minibatches per loop iteration; XLA then need not copy the state between them
 
 
 class Update(NamedTuple):
     """What one `update` gives back."""
 
     state: State
-    losses: dict[str, Array]  # scalars; anything not finite stops the run
-    error: Array  # (U, B) absolute errors, which a prioritised replay takes as feedback
+    losses: dict[str, Array]  # scalars; the run stops if one is not finite
+    td_error: Array  # (U, B) absolute TD errors, which a prioritised replay takes as feedback
 
 
-NO_MASK: Floats = np.zeros(0, np.float32)
-
-
-class Algorithm(Protocol):
+class Learner:
     """One member's learner: pure functions, no env, no files. The trainer alone lifts it to K.
 
-    A state is a NamedTuple. At its top, fields named `*_optimizer` and `updates` are its optimiser,
-    and `actor` with `target_actor` and the noise `sigma` its policy, which is all that a partial
-    copy needs to know. It never holds a random key: clones that shared one would stay equal for
-    ever.
+    A learner is a frozen dataclass of (spec, hyper). `init`, `act`, `update`, `policy_params` and
+    `policy` must be given; everything else has a default here. A state is a NamedTuple that never
+    holds a random key: clones that shared one would stay equal for ever.
     """
 
-    @property
-    def cycle(self) -> int:
-        """U, the critic updates of one call of `update`; 1 for a rollout."""
-        ...
+    Hyper: ClassVar[type]  # the settings class, from which flags, help and checks follow
+    spec: Spec
+    hyper: Any
 
-    def mask(self, rng: np.random.Generator) -> Floats:
-        """Bootstrap mask (N,) that is stored with a new row; N may be 0."""
-        ...
+    @classmethod
+    def build(cls, spec: Spec, hyper: Any) -> Self:
+        """The learner for a task and settings."""
+        return cls(spec, hyper)  # pyright: ignore[reportCallIssue]
+
+    @property
+    def updates_per_call(self) -> int:
+        """U, the critic updates that one call of `update` makes."""
+        return 1
 
     def init(self, key: Array) -> State:
-        """Networks, targets and optimiser of a new learner."""
-        ...
-
-    def acting(self, state: State) -> Any:
-        """The part of a state that acting needs, which is copied to NumPy after every update."""
-        ...
-
-    def begin(self, acting: Any, rng: np.random.Generator) -> Memory:
-        """What acting remembers within one episode, made anew at its start, in NumPy."""
-        ...
-
-    def act(
-        self, acting: Any, memory: Memory, observation: Floats, rng: np.random.Generator
-    ) -> tuple[Floats, Memory]:
-        """Exploring action (A,) for one observation (O,); the trainer cuts it at +-1 for the env.
-
-        The replay stores it cut, a rollout as it is, so that its probability can be computed. In
-        NumPy: for one observation that is several times faster than calling into JAX.
-        """
-        ...
+        """Networks, targets and optimiser state of a new learner."""
+        raise NotImplementedError
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
-        """One cycle of U updates."""
-        ...
+        """U updates on minibatches (U, B, ...), or one update on a rollout (T, E, ...)."""
+        raise NotImplementedError
 
-    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
-        """What so many updates and chosen actions cost the members beyond themselves, for every
-        row's ledger; most learners have nothing to add.
+    # How it acts.
+
+    def policy_params(self, state: State) -> Any:
+        """The part of a state that acting needs, which is copied to NumPy after every update."""
+        raise NotImplementedError
+
+    def start_episode(self, params: Any, rng: np.random.Generator) -> Any:
+        """The noise state of a new episode, in NumPy; none by default."""
+        return ()
+
+    def act(
+        self, params: Any, noise_state: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        """Exploring action (A,) for one observation (O,), and the next noise state.
+
+        The trainer clips the action to [-1, 1] for the env. The replay stores it clipped, a
+        rollout as it is, so that its probability can be computed. In NumPy: for one observation
+        that is several times faster than calling into JAX.
         """
-        ...
+        raise NotImplementedError
 
     def policy(self, state: State) -> Actors:
         """What acts without noise, as plain arrays for the policy file."""
-        ...
+        raise NotImplementedError
+
+    # What the trainer may ask besides.
+
+    def mask(self, rng: np.random.Generator) -> Floats:
+        """Bootstrap mask (N,) to store with a new transition; none by default."""
+        return np.zeros(0, np.float32)
+
+    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
+        """What so many updates and actions cost besides the members' own; nothing by default."""
+        return {}
+
+    def copy_weights(self, own: State, parent: State) -> State:
+        """The parent's networks with the member's own optimiser state (`--copy weights`)."""
+        raise UsageError(f"copy: {type(self).__name__} copies whole states only; allowed: full")
+
+    def copy_actor(self, own: State, parent: State) -> State:
+        """The member's own state with the parent's actor (`--copy actor`)."""
+        raise UsageError(f"copy: {type(self).__name__} copies whole states only; allowed: full")
+
+
+def each_minibatch(
+    step: Callable[[State, Batch, Array], tuple[State, Any]],
+    state: State,
+    batch: Batch,
+    keys: Array,
+) -> tuple[State, Any]:
+    """Scan `step(state, minibatch, key) -> (state, out)` over U minibatches; outs are stacked."""
+
+    def scanned(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:
+        return step(state, *inputs)
+
+    return jax.lax.scan(scanned, state, (batch, keys), unroll=min(len(keys), UNROLLED))
+
+
+def last_minibatch(batch: Batch) -> Batch:
+    """The last of U minibatches."""
+    return jax.tree.map(lambda x: x[-1], batch)

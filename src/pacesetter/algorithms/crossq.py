@@ -4,8 +4,8 @@ SAC without target networks, whose networks batch-renormalise the input of every
 
 for each of `policy_delay` minibatches:
     one pass of every critic over (s, a) and (s', a') together, a' ~ pi(s')
-    y = r + discount * (min_i critic_i(s', a') - alpha * log pi(a'|s')), without gradient
-    move every critic towards y at (s, a)
+    target_q = r + discount * (min_i critic_i(s', a') - alpha * log pi(a'|s')), without gradient
+    move every critic towards target_q at (s, a)
 move the actor up min_i critic_i(s, a) - alpha * log pi(a|s) on the last minibatch
 move alpha towards the target entropy
 
@@ -13,23 +13,21 @@ Networks that learn normalise by their batch and move their running statistics; 
 plain networks, into whose weights the running statistics are folded.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms import sac
-from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
-from pacesetter.algorithms.td3 import UNROLLED
-from pacesetter.networks import batch_renorm, critic_heads, mlp
-from pacesetter.policy import Actors, Floats, Layers
+from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
+from pacesetter.algorithms.stochastic import Exploration, StochasticLearner
+from pacesetter.batch import Batch, Spec
+from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
+from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, Count, OffPolicy, Width
 
 
@@ -44,20 +42,22 @@ class Hyper(OffPolicy):
     critic_hidden: tuple[Width, ...] = Field(
         (2048, 2048), min_length=1, description="widths of the critics' hidden layers"
     )
-    actor_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the actor")
-    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critics")
-    alpha_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the log temperature")
+    actor_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the actor")
+    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
+    alpha_learning_rate: float = Field(
+        1e-3, gt=0, description="Adam step size of the log temperature"
+    )
     adam_momentum: float = Field(
         0.5, ge=0, lt=1, description="Adam's first decay for actor and critics"
     )
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
-    target_entropy: float | None = Field(None, description="nats; none is minus the action size")
+    target_entropy: float | None = Field(None, description="in nats; default minus the action size")
     critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
-    policy_delay: int = Field(3, ge=1, le=1_000, description="critic updates an actor update")
+    policy_delay: int = Field(3, ge=1, le=1_000, description="critic updates per actor update")
     renorm_after: Count = Field(
         100_000, ge=0, description="a network's updates with plain batch norm before renorm"
     )
-    exploration: sac.Exploration = Field(
+    exploration: Exploration = Field(
         "policy", description="fixed: the stochastic policy explores by itself"
     )
 
@@ -68,33 +68,28 @@ class State(NamedTuple):
     actor: mlp.Network
     critic: mlp.Network
     log_alpha: Array
-    actor_optimizer: Any
-    critic_optimizer: Any
-    alpha_optimizer: Any
+    actor_opt_state: Any
+    critic_opt_state: Any
+    alpha_opt_state: Any
     updates: Array
 
 
 @dataclass(frozen=True)
-class CrossQ:
+class CrossQ(StochasticLearner):
     """The learner of one member."""
 
+    Hyper: ClassVar[type] = Hyper
     spec: Spec
-    hyper: Hyper
+    hyper: Any
 
     @property
-    def cycle(self) -> int:
+    def updates_per_call(self) -> int:
         return self.hyper.policy_delay
 
     @cached_property
     def head(self) -> critic_heads.Head:
         """What the critics' outputs mean."""
         return critic_heads.choose(0, self.hyper.replay)
-
-    def mask(self, rng: np.random.Generator) -> Floats:
-        return NO_MASK
-
-    def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
-        return {}
 
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
@@ -109,38 +104,23 @@ class CrossQ:
             actor=actor,
             critic=critic,
             log_alpha=log_alpha,
-            actor_optimizer=self._adam(hyper.actor_learning_rate).init(actor),
-            critic_optimizer=self._adam(hyper.critic_learning_rate).init(critic),
-            alpha_optimizer=optax.adam(hyper.alpha_learning_rate).init(log_alpha),
+            actor_opt_state=self._adam(hyper.actor_learning_rate).init(actor),
+            critic_opt_state=self._adam(hyper.critic_learning_rate).init(critic),
+            alpha_opt_state=optax.adam(hyper.alpha_learning_rate).init(log_alpha),
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def acting(self, state: State) -> mlp.Network:
+    def update(self, state: State, batch: Batch, key: Array) -> Update:
+        keys = jax.random.split(key, self.updates_per_call + 1)
+        state, (critic_loss, td_error) = each_minibatch(self.fit_critic, state, batch, keys[:-1])
+        state, losses = self.fit_actor(state, last_minibatch(batch), keys[-1])
+        return Update(state, {"critic_loss": critic_loss.mean(), **losses}, td_error)
+
+    def policy_params(self, state: State) -> mlp.Network:
         return batch_renorm.fold(state.actor)
 
-    def begin(self, acting: Layers, rng: np.random.Generator) -> tuple[()]:
-        return ()
-
-    def act(
-        self, acting: Layers, memory: Any, observation: Floats, rng: np.random.Generator
-    ) -> tuple[Floats, Any]:
-        return sac.explore(acting, observation, rng), memory
-
-    def update(self, state: State, batch: Batch, key: Array) -> Update:
-        def critic_step(state: State, inputs: tuple[Batch, Array]) -> tuple[State, Any]:
-            minibatch, step_key = inputs
-            state, loss, error = self.fit_critic(state, minibatch, minibatch.weight, step_key)
-            return state, (loss, error)
-
-        keys = jax.random.split(key, self.cycle + 1)
-        state, (critic_loss, error) = jax.lax.scan(
-            critic_step, state, (batch, keys[:-1]), unroll=min(self.cycle, UNROLLED)
-        )
-        state, losses = self.fit_actor(state, jax.tree.map(lambda x: x[-1], batch), keys[-1])
-        return Update(state, {"critic_loss": critic_loss.mean(), **losses}, error)
-
     def policy(self, state: State) -> Actors:
-        return sac.mean_policy(batch_renorm.fold(state.actor), self.spec.action_size)
+        return gaussian.mean_policy(batch_renorm.fold(state.actor), self.spec.action_size)
 
     def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B), by its running statistics."""
@@ -149,64 +129,57 @@ class CrossQ:
 
     # The pieces that `update` composes.
 
-    def fit_critic(
-        self, state: State, batch: Batch, weight: Array, key: Array
-    ) -> tuple[State, Array, Array]:
-        """One Adam step of all critics, with the target from the same pass; loss, |error| (B,)."""
-        following, log_prob = sac.sample(
+    def fit_critic(self, state: State, batch: Batch, key: Array) -> tuple[State, Any]:
+        """One Adam step of all critics, with the target from the same pass; loss, |TD error|."""
+        next_action, log_prob = gaussian.sample(
             batch_renorm.fold(state.actor), batch.next_observation, key
         )
         inputs = jnp.concatenate(
             [
                 jnp.concatenate([batch.observation, batch.action], axis=-1),
-                jnp.concatenate([batch.next_observation, following], axis=-1),
+                jnp.concatenate([batch.next_observation, next_action], axis=-1),
             ]
         )
         forward = partial(batch_renorm.train, warm=state.updates >= self.hyper.renorm_after)
 
         def loss(critic: mlp.Network) -> tuple[Array, Any]:
-            said, trained = mlp.each(forward, critic, inputs)
-            now, later = jnp.split(said, 2, axis=1)
-            soft = self.head.least(later) - jnp.exp(state.log_alpha) * log_prob
-            y = jax.lax.stop_gradient(batch.reward + batch.discount * soft)
-            losses, error = self.head.loss(now, y)
-            return (weight * losses).mean(axis=1).sum(), (error.max(axis=0), trained)
+            outputs, trained = mlp.each(forward, critic, inputs)
+            now, later = jnp.split(outputs, 2, axis=1)
+            next_q = self.head.min_q(later) - jnp.exp(state.log_alpha) * log_prob
+            target_q = jax.lax.stop_gradient(batch.reward + batch.discount * next_q)
+            losses, td_error = self.head.loss(now, target_q)
+            return (batch.weight * losses).mean(axis=1).sum(), (td_error.max(axis=0), trained)
 
-        (value, (error, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
+        (value, (td_error, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(
+            state.critic
+        )
         adam = self._adam(self.hyper.critic_learning_rate)
-        critic, optimizer = mlp.descend(adam, state.critic, gradient, state.critic_optimizer)
+        critic, opt_state = mlp.apply_gradient(adam, state.critic, gradient, state.critic_opt_state)
         state = state._replace(
             critic=batch_renorm.with_statistics(critic, trained),
-            critic_optimizer=optimizer,
+            critic_opt_state=opt_state,
             updates=state.updates + 1,
         )
-        return state, value, error
+        return state, (value, td_error)
 
     def fit_actor(self, state: State, batch: Batch, key: Array) -> tuple[State, dict[str, Array]]:
         """One Adam step of the actor on the critics as they evaluate, one of the temperature."""
         alpha = jnp.exp(state.log_alpha)
-        warm = state.updates // self.cycle > self.hyper.renorm_after
+        warm = state.updates // self.updates_per_call > self.hyper.renorm_after
 
         def loss(actor: mlp.Network) -> tuple[Array, Any]:
-            said, trained = batch_renorm.train(actor, batch.observation, warm)
-            action, log_prob = sac.sample_from(said, key)
-            values = self.values(state.critic, batch.observation, action).min(axis=0)
-            return (alpha * log_prob - values).mean(), (log_prob.mean(), trained)
+            outputs, trained = batch_renorm.train(actor, batch.observation, warm)
+            action, log_prob = gaussian.sample_from(outputs, key)
+            value = critic_heads.min_q(self.values(state.critic, batch.observation, action))
+            return (alpha * log_prob - value).mean(), (log_prob.mean(), trained)
 
         (value, (log_prob, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = self._adam(self.hyper.actor_learning_rate)
-        actor, optimizer = mlp.descend(adam, state.actor, gradient, state.actor_optimizer)
-        state = state._replace(
-            actor=batch_renorm.with_statistics(actor, trained), actor_optimizer=optimizer
-        )
-        return sac.fit_temperature(self, state, log_prob), {
-            "actor_loss": value,
-            "alpha": alpha,
-            "entropy": -log_prob,
-        }
+        actor, opt_state = mlp.apply_gradient(adam, state.actor, gradient, state.actor_opt_state)
+        actor = batch_renorm.with_statistics(actor, trained)
+        state = state._replace(actor=actor, actor_opt_state=opt_state)
+        losses = {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
+        return self.fit_temperature(state, log_prob), losses
 
     def _adam(self, rate: float) -> optax.GradientTransformation:
         return optax.adam(rate, b1=self.hyper.adam_momentum)
-
-
-build = CrossQ

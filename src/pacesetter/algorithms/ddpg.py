@@ -4,13 +4,17 @@ One critic, no delay, no noise on the target action; everything else is TD3's. T
 `ddpg-original` sets what differs in Lillicrap et al. 2016; without batch normalisation.
 """
 
-from typing import Annotated
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, ClassVar
 
+import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import td3
-from pacesetter.algorithms.contract import Spec
+from pacesetter.algorithms.contract import Array
+from pacesetter.networks import mlp
 from pacesetter.settings import STRICT, only
 
 
@@ -24,10 +28,35 @@ class Hyper(td3.Hyper):
     )
     target_noise: Annotated[float, only(0)] = Field(0.0, description="fixed: no target smoothing")
     action_layer: int = Field(0, ge=0, le=1, description="critic layer that the action joins")
-    critic_decay: float = Field(0.0, ge=0, description="L2 added to the critic's gradient")
-    output_bound: float | None = Field(None, gt=0, description="bound of initial output weights")
+    critic_decay: float = Field(0.0, ge=0, description="L2 decay added to the critic's gradient")
+    output_bound: float | None = Field(
+        None, gt=0, description="bound of initial output weights; default 1/sqrt(inputs)"
+    )
 
 
-def build(spec: Spec, hyper: Hyper) -> td3.TD3:
+@dataclass(frozen=True)
+class DDPG(td3.TD3):
     """The learner of one member."""
-    return td3.TD3(spec, hyper, hyper.action_layer, hyper.critic_decay, hyper.output_bound)
+
+    Hyper: ClassVar[type] = Hyper
+
+    def critic_outputs(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
+        return mlp.outputs(critic, observation, action, self.hyper.action_layer)
+
+    def new_actor(self, key: Array) -> mlp.Network:
+        (observation, action), hyper = self.spec, self.hyper
+        norm, bound = hyper.actor_layer_norm, hyper.output_bound
+        sizes = (observation, hyper.hidden, action)
+        return mlp.init(key, *sizes, layer_norm=norm, output_bound=bound)
+
+    def new_critic(self, key: Array) -> mlp.Network:
+        (observation, action), hyper = self.spec, self.hyper
+        new = partial(mlp.init, layer_norm=hyper.critic_layer_norm, output_bound=hyper.output_bound)
+        sizes = (observation, hyper.hidden, self.head.outputs)
+        return new(key, *sizes, joins=(hyper.action_layer, action))
+
+    @property
+    def critic_optimizer(self) -> optax.GradientTransformation:
+        adam = super().critic_optimizer
+        decay = self.hyper.critic_decay
+        return optax.chain(optax.add_decayed_weights(decay), adam) if decay else optax.chain(adam)

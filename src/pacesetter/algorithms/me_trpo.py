@@ -10,7 +10,8 @@ until none was kept for `patience` updates; go on with the policy kept last
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +20,14 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import trpo
-from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms.contract import Array, Learner, Update
+from pacesetter.batch import Batch, Spec
 from pacesetter.dynamics.fit import fit
 from pacesetter.dynamics.model import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
-from pacesetter.networks.trust_region import Gaussian, moments
-from pacesetter.policy import OBSERVATION_LIMIT, Actors, Floats
+from pacesetter.networks.trust_region import Gaussian, distribution_of
+from pacesetter.policy import OBSERVATION_LIMIT, Actors
 from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
+from pacesetter.types import Floats
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -78,16 +81,35 @@ class Search(NamedTuple):
 
 
 @dataclass(frozen=True)
-class METRPO:
+class METRPO(Learner):
     """The learner of one member."""
 
-    base: trpo.TRPO
-    dynamics: Dynamics
-    hyper: Hyper
-    cycle: int = 1
+    Hyper: ClassVar[type] = Hyper
+    spec: Spec
+    hyper: Any
+    known: Known | None = None  # what is known of the task replaces learned heads
 
-    def mask(self, rng: np.random.Generator) -> Floats:
-        return NO_MASK
+    @classmethod
+    def build(cls, spec: Spec, hyper: Any, known: Known | None = None) -> Self:
+        return cls(spec, hyper, known)
+
+    @cached_property
+    def base(self) -> trpo.TRPO:
+        """What improves the policy in the models."""
+        return trpo.TRPO(self.spec, self.hyper)
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """The models of the task."""
+        hyper = self.hyper
+        return Dynamics(
+            self.spec,
+            members=hyper.models,
+            hidden=hyper.model_hidden,
+            known=self.known,
+            form=GAUSSIAN if hyper.model_noise else DETERMINISTIC,
+            learning_rate=hyper.model_learning_rate,
+        )
 
     def init(self, key: Array) -> State:
         learner_key, models_key = jax.random.split(key)
@@ -95,16 +117,13 @@ class METRPO:
         none = jnp.zeros((), jnp.int32)
         return State(self.base.init(learner_key), models, none, none, none)
 
-    def acting(self, state: State) -> Gaussian:
+    def policy_params(self, state: State) -> Gaussian:
         return state.learner.actor
 
-    def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
-        return ()
-
     def act(
-        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
+        self, params: Any, noise_state: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        return self.base.act(acting, memory, observation, rng)
+        return self.base.act(params, noise_state, observation, rng)
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         """One iteration on all real steps, the first `valid` of (S, ...), and reset `starts`."""
@@ -205,22 +224,22 @@ class METRPO:
 
         def step(observation: Array, key: Array) -> tuple[Array, Batch]:
             act_key, choice_key, model_key, start_key = jax.random.split(key, 4)
-            mean, log_std = moments(actor, observation)
+            mean, log_std = distribution_of(actor, observation)
             action = mean + jnp.exp(log_std) * jax.random.normal(act_key, mean.shape)
             one = dynamics.choose(models, jax.random.randint(choice_key, (), 0, dynamics.members))
             parts = self.transition(one, observation[None], action[None], model_key)
-            following, reward, terminated = (part[0] for part in parts)
+            next_observation, reward, terminated = (part[0] for part in parts)
             row = Batch(
                 observation=observation,
                 action=action,
                 reward=reward,
-                next_observation=following,
+                next_observation=next_observation,
                 discount=hyper.gamma * (1.0 - terminated),
                 last=1.0 * terminated,
                 weight=jnp.ones(envs),
                 mask=jnp.zeros((envs, 0)),
             )
-            return jnp.where(terminated[:, None], some_starts(start_key), following), row
+            return jnp.where(terminated[:, None], some_starts(start_key), next_observation), row
 
         start_key, steps_key = jax.random.split(key)
         keys = jax.random.split(steps_key, hyper.horizon)
@@ -234,9 +253,9 @@ class METRPO:
 
         def step(carry: tuple[Array, Array], key: Array) -> tuple[Any, Array]:
             observation, running = carry
-            action, _ = moments(actor, observation)
-            following, reward, terminated = self.transition(models, observation, action, key)
-            return (following, running & ~terminated), running * reward
+            action, _ = distribution_of(actor, observation)
+            next_observation, reward, terminated = self.transition(models, observation, action, key)
+            return (next_observation, running & ~terminated), running * reward
 
         observation = jnp.stack([starts] * self.dynamics.members)
         running = jnp.ones(observation.shape[:-1], bool)
@@ -254,28 +273,15 @@ class METRPO:
         """
         dynamics, scale = self.dynamics, models.scale
         action = jnp.clip(action, -1, 1)
-        size = self.base.spec.observation_size
+        size = self.spec.observation_size
         mean, reach = scale.mean[:size], OBSERVATION_LIMIT * scale.deviation[:size]
-        following = dynamics.sample(models, observation, action, key)
-        following = jnp.clip(following, mean - reach, mean + reach)
-        reward = dynamics.reward(models, observation, action, following).mean(axis=0)
-        ends = dynamics.terminated(models, observation, action, following)
-        return following, reward, ends > 0.5
+        next_observation = dynamics.sample(models, observation, action, key)
+        next_observation = jnp.clip(next_observation, mean - reach, mean + reach)
+        reward = dynamics.reward(models, observation, action, next_observation).mean(axis=0)
+        ends = dynamics.terminated(models, observation, action, next_observation)
+        return next_observation, reward, ends > 0.5
 
 
 def agree(returns: Array, before: Array, share: float) -> Array:
     """Whether at least a share of the models (K,) sees no fall."""
     return (returns >= before).sum() >= share * len(returns) - 1e-6
-
-
-def build(spec: Spec, hyper: Hyper, known: Known | None = None) -> METRPO:
-    """The learner of one member; what is known of the task replaces learned heads."""
-    dynamics = Dynamics(
-        spec,
-        members=hyper.models,
-        hidden=hyper.model_hidden,
-        known=known,
-        form=GAUSSIAN if hyper.model_noise else DETERMINISTIC,
-        learning_rate=hyper.model_learning_rate,
-    )
-    return METRPO(trpo.TRPO(spec, hyper), dynamics, hyper)

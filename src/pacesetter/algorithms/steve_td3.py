@@ -4,28 +4,30 @@ Not in the paper, but what a fair test against TD3 needs: with horizon 0 and one
 The actor climbs the mean of the first twins.
 """
 
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import steve, td3
-from pacesetter.algorithms.contract import Spec
 from pacesetter.settings import STRICT
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Hyper(steve.Expansion, td3.Hyper):
+class Hyper(steve.ExpansionHyper, td3.Hyper):
     """TD3's settings and the expansion's."""
 
     critic_members: Annotated[int, AfterValidator(steve.can_disagree)] = Field(
         2,
         ge=1,
         validate_default=True,
-        description="pairs of critics that give the target its variance",
+        description="pairs of critics whose disagreement weights the target",
     )
 
 
-def build(spec: Spec, hyper: Hyper) -> steve.STEVE:
-    """The learner of one member."""
-    return steve.over(spec, hyper)
+@dataclass(frozen=True)
+class SteveTD3(steve.Expansion):
+    """The learner of one member, over TD3."""
+
+    Hyper: ClassVar[type] = Hyper

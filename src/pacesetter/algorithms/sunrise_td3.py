@@ -4,15 +4,16 @@ Everything of the ensemble is as in `sunrise`; its learners are TD3's, with thei
 actions, their Gaussian noise on proposals and an actor update every `policy_delay` critic updates.
 """
 
-from functools import partial
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
 
 import jax.numpy as jnp
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import sunrise, td3
-from pacesetter.algorithms.contract import Array, Batch, Spec
+from pacesetter.algorithms.contract import Array
+from pacesetter.batch import Batch, Spec
 from pacesetter.settings import STRICT
 
 
@@ -23,21 +24,24 @@ class Hyper(sunrise.Ensemble, td3.Hyper):
     exploration: Literal["gaussian"] = Field("gaussian", description="noise on proposed actions")
 
 
-def build(spec: Spec, hyper: Hyper) -> sunrise.Sunrise:
+@dataclass(frozen=True)
+class SunriseTD3(sunrise.Sunrise):
     """The learner of one member."""
-    learner = td3.TD3(spec, hyper)
-    base = sunrise.Base(learner, partial(_next_action, learner), partial(_fit_actor, learner))
-    return sunrise.assemble(spec, hyper, base)
 
+    Hyper: ClassVar[type] = Hyper
 
-def _next_action(
-    learner: td3.TD3, state: td3.State, observation: Array, key: Array
-) -> tuple[Array, Array]:
-    return learner.next_action(state, observation, key), jnp.zeros(len(observation))
+    @classmethod
+    def build(cls, spec: Spec, hyper: Any) -> Self:
+        return cls(spec, hyper, td3.TD3(spec, hyper))
 
+    def next_action(self, state: td3.State, observation: Array, key: Array) -> tuple[Array, Array]:
+        return self.base.next_action(state, observation, key), jnp.zeros(len(observation))
 
-def _fit_actor(
-    learner: td3.TD3, state: td3.State, batch: Batch, key: Array, weight: Array
-) -> tuple[td3.State, dict[str, Array]]:
-    state, loss = learner.fit_actor(state, batch, weight)
-    return state, {"actor_loss": loss}
+    def fit_actor(
+        self, state: td3.State, batch: Batch, key: Array, weight: Array
+    ) -> tuple[td3.State, dict[str, Array]]:
+        state, loss = self.base.fit_actor(state, batch, weight)
+        return state, {"actor_loss": loss}
+
+    def _of_base(self, params: sunrise.Params) -> Any:
+        return params.actor, ()

@@ -9,7 +9,7 @@ fit V to V + A
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,19 +20,21 @@ from jax.scipy.sparse.linalg import cg
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import NO_MASK, Array, Batch, Spec, Update
+from pacesetter.algorithms.contract import Array, Learner, Update
+from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.networks.trust_region import (
+    Distribution,
     Gaussian,
-    Moments,
+    distribution_of,
     fisher_product,
     kl,
     line_search,
     log_probability,
-    moments,
 )
-from pacesetter.policy import Actors, Floats, forward
+from pacesetter.policy import Actors, forward
 from pacesetter.settings import STRICT, OnPolicy, Width
+from pacesetter.types import Floats
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -57,21 +59,18 @@ class State(NamedTuple):
 
     actor: Gaussian
     critic: mlp.Network
-    critic_optimizer: Any
+    critic_opt_state: Any
     returns: Array  # (3,): count, mean and squared deviations of the critic's targets so far
     updates: Array
 
 
 @dataclass(frozen=True)
-class TRPO:
+class TRPO(Learner):
     """The learner of one member."""
 
+    Hyper: ClassVar[type] = Hyper
     spec: Spec
-    hyper: Hyper
-    cycle: int = 1
-
-    def mask(self, rng: np.random.Generator) -> Floats:
-        return NO_MASK
+    hyper: Any
 
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
@@ -83,22 +82,20 @@ class TRPO:
                 jnp.full(action, np.log(self.hyper.initial_std), jnp.float32),
             ),
             critic=critic,
-            critic_optimizer=self._adam.init(critic),
+            critic_opt_state=self._adam.init(critic),
             returns=jnp.zeros(3),
             updates=jnp.zeros((), jnp.int32),
         )
 
-    def acting(self, state: State) -> Gaussian:
+    def policy_params(self, state: State) -> Gaussian:
         return state.actor
 
-    def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
-        return ()
-
     def act(
-        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
+        self, params: Any, noise_state: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        mean = forward(acting.network, observation, np.tanh)
-        return mean + np.exp(acting.log_std) * rng.standard_normal(len(mean), np.float32), memory
+        mean = forward(params.network, observation, np.tanh)
+        noise = rng.standard_normal(len(mean), np.float32)
+        return mean + np.exp(params.log_std) * noise, noise_state
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         """One iteration on a rollout (T, E, ...)."""
@@ -131,7 +128,7 @@ class TRPO:
     def values(self, state: State, observation: Array) -> Array:
         """V (...) of observations (..., O), in units of reward."""
         scaled = mlp.apply(state.critic, observation, jnp.tanh)[..., 0]
-        return scaled * deviation(state.returns)
+        return scaled * standard_deviation(state.returns)
 
     def fit_actor(
         self, actor: Gaussian, observation: Array, action: Array, advantage: Array
@@ -140,8 +137,8 @@ class TRPO:
         hyper = self.hyper
         parameters, unravel = ravel_pytree(actor)
 
-        def distribution(parameters: Array) -> Moments:
-            return moments(unravel(parameters), observation)
+        def distribution(parameters: Array) -> Distribution:
+            return distribution_of(unravel(parameters), observation)
 
         old = distribution(parameters)
         old_log_prob = log_probability(old, action)
@@ -182,8 +179,8 @@ class TRPO:
     ) -> tuple[State, Array]:
         """Adam on minibatches (B,) of squared errors; the targets first join the scale."""
         size = min(self.hyper.critic_batch_size, len(targets))
-        returns = add_moments(state.returns, targets)
-        scaled = targets / deviation(returns)
+        returns = add_statistics(state.returns, targets)
+        scaled = targets / standard_deviation(returns)
 
         def loss(critic: mlp.Network, rows: Array) -> Array:
             values = mlp.apply(critic, observation[rows], jnp.tanh)[..., 0]
@@ -191,26 +188,23 @@ class TRPO:
 
         def step(carry: Any, rows: Array) -> tuple[Any, Array]:
             value, gradient = jax.value_and_grad(loss)(carry[0], rows)
-            return mlp.descend(self._adam, carry[0], gradient, carry[1]), value
+            return mlp.apply_gradient(self._adam, carry[0], gradient, carry[1]), value
 
         def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
             order = jax.random.permutation(key, len(targets))
             whole = len(targets) // size * size  # the few rows left over differ at every pass
             return jax.lax.scan(step, carry, order[:whole].reshape(-1, size))
 
-        carry = (state.critic, state.critic_optimizer)
+        carry = (state.critic, state.critic_opt_state)
         (critic, optimizer), _ = jax.lax.scan(
             epoch, carry, jax.random.split(key, self.hyper.critic_epochs)
         )
-        state = state._replace(critic=critic, critic_optimizer=optimizer, returns=returns)
+        state = state._replace(critic=critic, critic_opt_state=optimizer, returns=returns)
         return state, loss(critic, jnp.arange(len(targets)))
 
     @property
     def _adam(self) -> optax.GradientTransformation:
         return optax.adam(self.hyper.critic_learning_rate)
-
-
-build = TRPO
 
 
 def advantages(batch: Batch, values: Array, next_values: Array, decay: float) -> Array:
@@ -231,11 +225,11 @@ def advantages(batch: Batch, values: Array, next_values: Array, decay: float) ->
 
 
 def standardize(x: Array) -> Array:
-    """Mean 0 and deviation 1; equal numbers become 0."""
+    """Mean 0 and standard deviation 1; equal numbers become 0."""
     return (x - x.mean()) / (x.std() + 1e-8)
 
 
-def add_moments(sums: Array, values: Array) -> Array:
+def add_statistics(sums: Array, values: Array) -> Array:
     """Count, mean and squared deviations (3,) with more values (B,) (Chan et al. 1979)."""
     count, mean, squares = sums
     added, total = len(values), count + len(values)
@@ -244,7 +238,7 @@ def add_moments(sums: Array, values: Array) -> Array:
     return jnp.stack([total, mean + change * added / total, squares])
 
 
-def deviation(sums: Array) -> Array:
+def standard_deviation(sums: Array) -> Array:
     """Of what the sums have seen; 1 before anything was seen or if all of it was equal."""
     count, _, squares = sums
     variance = squares / jnp.maximum(count, 1)

@@ -13,11 +13,11 @@ SHOWN_EVALUATIONS = 5
 
 def algorithms() -> list[str]:
     """Algorithms and what each is, with the ensemble form of each."""
-    from pacesetter.algorithms import TABLE, alone, names, plugins
+    from pacesetter.algorithms import TABLE, names, plugins, single_member
 
     rows = [(name, entry.help) for name, entry in TABLE.items()]
     rows += [(name, target) for name, target in plugins().items()]
-    several = [name for name in names() if not alone(name)]
+    several = [name for name in names() if not single_member(name)]
     rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
     return _table(rows)
 

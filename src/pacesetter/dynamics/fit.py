@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pacesetter.algorithms.contract import Array, Batch
+from pacesetter.algorithms.contract import Array
+from pacesetter.batch import Batch
 from pacesetter.dynamics.model import Dynamics, Models, Networks, Scale, quantities
 
 TOGETHER = 50  # rows next to each other in time, nearly alike, so on one side
@@ -41,7 +42,7 @@ class Subset(NamedTuple):
 
 class _Run(NamedTuple):
     models: Models
-    moments: Any
+    opt_state: Any
     best: Networks
     loss: Array  # of the best
     stale: Array  # epochs since then
@@ -68,7 +69,7 @@ def fit(
     aside = held_out(len(data.reward))
     training, checking = Subset.of(in_use & ~aside), Subset.of(in_use & aside)
     models = models._replace(scale=measure(rows, in_use & ~aside))
-    moments = dynamics.init_optimizer(models)
+    opt_state = dynamics.init_opt_state(models)
     steps = -(-training.size // batch_size)
 
     def minibatch(key: Array) -> Batch:
@@ -80,20 +81,20 @@ def fit(
 
         def learn(step: Any, carry: tuple[Models, Any]) -> tuple[Models, Any]:
             batch = minibatch(jax.random.fold_in(epoch_key, step))
-            models, moments, _ = dynamics.step(*carry, batch)
-            return models, moments
+            models, opt_state, _ = dynamics.step(*carry, batch)
+            return models, opt_state
 
-        models, moments = jax.lax.fori_loop(0, steps, learn, (run.models, run.moments))
+        models, opt_state = jax.lax.fori_loop(0, steps, learn, (run.models, run.opt_state))
         loss = held_out_loss(dynamics, models, rows, checking)
         fell = loss + IMPROVEMENT * jnp.abs(loss) < run.loss  # a log-likelihood has any sign
         better = fell & (run.stale < patience)
         best = jax.tree.map(partial(where, better), models.networks, run.best)
         stale = jnp.where(better, 0, run.stale + 1)
         loss = jnp.where(better, loss, run.loss)
-        return _Run(models, moments, best, loss, stale, run.epoch + 1)
+        return _Run(models, opt_state, best, loss, stale, run.epoch + 1)
 
     none = jnp.zeros(dynamics.members, jnp.int32)
-    start = _Run(models, moments, models.networks, none + jnp.inf, none, jnp.zeros((), jnp.int32))
+    start = _Run(models, opt_state, models.networks, none + jnp.inf, none, jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(
         lambda run: (run.stale < patience).any() & (run.epoch < epochs), epoch, start
     )

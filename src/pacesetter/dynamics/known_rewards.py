@@ -30,17 +30,17 @@ class Task(NamedTuple):
     contact_cost: See = lambda observation: jnp.zeros(observation.shape[:-1])
     action_bound: float = 1.0
 
-    def reward(self, observation: Array, action: Array, following: Array) -> Array:
+    def reward(self, observation: Array, action: Array, next_observation: Array) -> Array:
         """Reward (...) of a transition with an action in [-1, 1]."""
-        speed = (self.speed(observation) + self.speed(following)) / 2
-        alive = jnp.logical_or(self.healthy(following), self.pays_fall)
+        speed = (self.speed(observation) + self.speed(next_observation)) / 2
+        alive = jnp.logical_or(self.healthy(next_observation), self.pays_fall)
         cost = self.control_cost * jnp.sum((self.action_bound * jnp.clip(action, -1, 1)) ** 2, -1)
         paid = self.speed_reward * speed + self.healthy_reward * alive
-        return paid - cost - self.contact_cost(following)
+        return paid - cost - self.contact_cost(next_observation)
 
-    def terminated(self, following: Array) -> Array:
+    def terminated(self, next_observation: Array) -> Array:
         """Whether the task ends (...) where this observation was reached."""
-        return jnp.logical_not(self.healthy(following))
+        return jnp.logical_not(self.healthy(next_observation))
 
 
 def of(env: str, env_kwargs: dict[str, Any] | None = None) -> Known:

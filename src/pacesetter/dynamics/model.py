@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pacesetter.algorithms.contract import Array, Batch, Spec
+from pacesetter.algorithms.contract import Array
+from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.policy import OBSERVATION_LIMIT
 
@@ -127,8 +128,8 @@ class Dynamics:
         scale = Scale(jnp.zeros(size), jnp.ones(size), jnp.zeros((), jnp.int32))
         return Models(jax.vmap(new)(jax.random.split(key, self.members)), scale)
 
-    def init_optimizer(self, models: Models) -> Any:
-        """Adam's moments of all networks."""
+    def init_opt_state(self, models: Models) -> Any:
+        """Adam's opt_state of all networks."""
         return self._adam.init(models.networks)
 
     def choose(self, models: Models, member: Array | int) -> Models:
@@ -143,29 +144,31 @@ class Dynamics:
         outputs = jax.vmap(mlp.apply)(models.networks.change, inputs)
         mean, log_variance = self.form.read(outputs)
         centre, deviation = self._of_change(models.scale)
-        following = observation + centre + deviation * mean
-        return following, deviation * jnp.exp(0.5 * log_variance)
+        next_observation = observation + centre + deviation * mean
+        return next_observation, deviation * jnp.exp(0.5 * log_variance)
 
     def sample(self, models: Models, observation: Array, action: Array, key: Array) -> Array:
         """A next observation (K, B, O) of each member; the mean if the form is deterministic."""
         mean, deviation = self.predict(models, observation, action)
         return mean + deviation * jax.random.normal(key, mean.shape)
 
-    def reward(self, models: Models, observation: Array, action: Array, following: Array) -> Array:
+    def reward(
+        self, models: Models, observation: Array, action: Array, next_observation: Array
+    ) -> Array:
         """What every reward head says (N, ...) of transitions (...); N is 1 if it is known."""
         if self.known:
-            return self.known.reward(observation, action, following)[None]
-        inputs = self._scaled(models.scale, observation, action, following - observation)
+            return self.known.reward(observation, action, next_observation)[None]
+        inputs = self._scaled(models.scale, observation, action, next_observation - observation)
         scaled = jax.vmap(mlp.apply, (0, None))(models.networks.reward, inputs)[..., 0]
         return models.scale.mean[-1] + models.scale.deviation[-1] * scaled
 
     def terminated(
-        self, models: Models, observation: Array, action: Array, following: Array
+        self, models: Models, observation: Array, action: Array, next_observation: Array
     ) -> Array:
         """Each member's probability (K, B) that its own transition ends the task."""
         if self.known:
-            return self.known.terminated(following).astype(following.dtype)
-        inputs = self._scaled(models.scale, observation, action, following - observation)
+            return self.known.terminated(next_observation).astype(next_observation.dtype)
+        inputs = self._scaled(models.scale, observation, action, next_observation - observation)
         return jax.nn.sigmoid(jax.vmap(mlp.apply)(models.networks.terminated, inputs)[..., 0])
 
     # How they learn.
@@ -197,15 +200,15 @@ class Dynamics:
             rows += optax.sigmoid_binary_cross_entropy(logit, ended)
         return (batch.weight * rows).mean(axis=-1)
 
-    def step(self, models: Models, moments: Any, batch: Batch) -> tuple[Models, Any, Array]:
+    def step(self, models: Models, opt_state: Any, batch: Batch) -> tuple[Models, Any, Array]:
         """One Adam step of every member on its own rows (K, B, ...); the mean loss."""
 
         def loss(networks: Networks) -> Array:
             return self.losses(networks, models.scale, batch).sum()
 
         value, gradient = jax.value_and_grad(loss)(models.networks)
-        networks, moments = mlp.descend(self._adam, models.networks, gradient, moments)
-        return models._replace(networks=networks), moments, value / self.members
+        networks, opt_state = mlp.apply_gradient(self._adam, models.networks, gradient, opt_state)
+        return models._replace(networks=networks), opt_state, value / self.members
 
     def _of_change(self, scale: Scale) -> tuple[Array, Array]:
         """Mean and deviation (O,) of the change of state."""

@@ -15,22 +15,25 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Algorithm, Spec
+from pacesetter.algorithms.contract import Learner
+from pacesetter.batch import Layout, Spec, Transition
 from pacesetter.config import Config
 from pacesetter.ensemble import selection as selections
+from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.ensemble.progress import Member, Progress
 from pacesetter.ensemble.rules import Parents
 from pacesetter.ensemble.selection import Selection
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, blame
-from pacesetter.learner.compiled import Cycle, Population, inherit
+from pacesetter.learner.compiled import Cycle, Population
 from pacesetter.learner.normalizer import Normalizer, Statistics
-from pacesetter.policy import Floats, Policy, clip, normalize
+from pacesetter.policy import Policy, clip, normalize
 from pacesetter.process import threads
-from pacesetter.replay.buffer import Columns, Replay, Sample
-from pacesetter.replay.n_step import Pending, Transition
+from pacesetter.replay.buffer import Replay, Sample
+from pacesetter.replay.n_step import Pending
 from pacesetter.replay.priorities import choose
 from pacesetter.seeding import Stream, generator
+from pacesetter.types import Floats
 
 LONGEST = 500  # cycles a member and tick, so that a run can be stopped and saved between them
 ASSESS_AFTER = 750_000  # updates (TD7)
@@ -43,13 +46,14 @@ class Ensemble:
         run, hyper, first = config.run, config.hyper, envs[0]
         self.config, self.envs = config, envs
         spec = Spec(first.observation_size, first.action_size)
-        self.algorithm: Algorithm = algorithms.find(run.algorithm).build(spec, hyper)
-        self.columns = columns = Columns(*spec, len(self.algorithm.mask(generator(0, Stream.MASK))))
+        self.algorithm: Learner = algorithms.find(run.algorithm).build(spec, hyper)
+        masks = len(self.algorithm.mask(generator(0, Stream.MASK)))
+        self.layout = layout = Layout(spec, masks)
         self.population = Population(
-            self.algorithm, columns, run.seed, hyper.normalize_observation, hyper.precision
+            self.algorithm, layout, run.seed, hyper.normalize_observation, hyper.precision
         )
         self.states = self.population.init(run.members, run.same_init)
-        self.acting = self.population.acting(self.states)
+        self.acting = self.population.policy_params(self.states)
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.unchanged = self.normalizer.statistics()
@@ -65,7 +69,7 @@ class Ensemble:
         self.mask_streams = [generator(run.seed, Stream.MASK, k) for k in range(run.members)]
         self.rule_stream = generator(run.seed, Stream.RULE)
         spare = generator(run.seed, Stream.ACT)
-        self.memory = [self.algorithm.begin(acting, spare) for acting in self.acting]
+        self.memory = [self.algorithm.start_episode(acting, spare) for acting in self.acting]
         self.progress = Progress.of(run.members)
         every = run.select_every * config.unit
         self.progress.next_selection = (config.select_after // every + 1) * every
@@ -78,7 +82,7 @@ class Ensemble:
         for i in range(count):
             path = folder / f"replay-{i}.bin"
             drawing = choose(self.config.hyper, min(size, self.budget))
-            self.replays.append(Replay(path, self.columns, size, self.budget, drawing))
+            self.replays.append(Replay(path, self.layout, size, self.budget, drawing))
 
     @property
     def streams(self) -> list[np.random.Generator]:
@@ -153,7 +157,7 @@ class Ensemble:
             self.envs[k].reset()
         member.start(self.progress.step)
         member.assessment.over = False
-        self.memory[k] = self.algorithm.begin(self.acting[k], self.act_streams[k])
+        self.memory[k] = self.algorithm.start_episode(self.acting[k], self.act_streams[k])
 
     def _random(self, k: int) -> Floats:
         size = self.envs[k].action_size
@@ -188,7 +192,7 @@ class Ensemble:
             earned=member.episode_return,
         )
         for row in self.pending[k].push(transition):
-            self.replay(k).add(*row, member=k)
+            self.replay(k).add(row, k)
         if self.population.normalize:
             self.normalizer.add(before)
         member.step(step.reward)
@@ -213,7 +217,7 @@ class Ensemble:
         """Whether a fixed policy is kept, dropped, or assessed further before it learns on."""
         hyper, step = self.config.hyper, self.progress.step
         after = ASSESS_AFTER if hyper.assess_after is None else hyper.assess_after
-        long = member.cycles * self.algorithm.cycle >= after
+        long = member.cycles * self.algorithm.updates_per_call >= after
         verdict = member.assessment.add(member.episode_return, long, hyper.assess)
         if verdict is not None:
             self.progress.assessed.append([k, verdict])
@@ -224,7 +228,7 @@ class Ensemble:
     def abandon(self, k: int) -> None:
         """Give up a running episode that cannot be entered again; its rows stay."""
         for row in self.pending[k].flush():
-            self.replay(k).add(*row, member=k)
+            self.replay(k).add(row, k)
         self.replay(k).drawing.end(k, None)
         self.progress.members[k].abandon()
 
@@ -240,7 +244,7 @@ class Ensemble:
 
     def _ready(self, k: int) -> bool:
         hyper, member = self.config.hyper, self.progress.members[k]
-        if member.owed < self.algorithm.cycle or not len(self.replay(k)):
+        if member.owed < self.algorithm.updates_per_call or not len(self.replay(k)):
             return False
         if member.steps % hyper.block or (hyper.update_at == "episode" and member.active):
             return False
@@ -260,7 +264,7 @@ class Ensemble:
             self.progress.members[k].cycles += 1
 
     def _draw(self, k: int) -> Sample:
-        progress, cycle = self.progress, self.algorithm.cycle
+        progress, cycle = self.progress, self.algorithm.updates_per_call
         shape = (cycle, self.config.hyper.batch_size)
         progress.members[k].owed -= cycle
         progress.updates += cycle
@@ -308,8 +312,8 @@ class Ensemble:
 
     def descend(self, parents: Parents) -> None:
         """Every member starts again from its parent, and from what was found of its policy."""
-        self.states = inherit(self.states, parents, self.config.run.copy)
-        self.acting = self.population.acting(self.states)
+        self.states = copy_from_parents(self.algorithm, self.states, parents, self.config.run.copy)
+        self.acting = self.population.policy_params(self.states)
         self.kept = [self.kept[parent] for parent in parents]
         for k, parent in enumerate(parents):
             if parent != k:  # what it earned so far in a running episode was not its new weights'

@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pacesetter.algorithms.contract import Algorithm, Array, State
-from pacesetter.ensemble.rules import Parents
+from pacesetter.algorithms.contract import Array, Learner, State
+from pacesetter.batch import Layout
 from pacesetter.envs import Environment
 from pacesetter.learner.backend import compiler_options
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
-from pacesetter.policy import OBSERVATION_LIMIT, Floats, Policy, unstack
-from pacesetter.replay.buffer import Columns
+from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
+from pacesetter.types import Floats
 
 KEYS = 1024  # made in one call: in the update itself they would come before every product
 
@@ -48,16 +48,16 @@ class Population:
 
     def __init__(
         self,
-        algorithm: Algorithm,
-        columns: Columns,
+        algorithm: Learner,
+        layout: Layout,
         seed: int,
         normalize: bool,
         precision: str = "f32",
     ) -> None:
-        self.algorithm, self.columns, self.normalize = algorithm, columns, normalize
+        self.algorithm, self.layout, self.normalize = algorithm, layout, normalize
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
-        self._acting = jax.jit(algorithm.acting)
+        self._acting = jax.jit(algorithm.policy_params)
         self._fold = jax.jit(self._fold_keys)
         self._keys = lru_cache(maxsize=1024)(self._make_keys)
         update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
@@ -67,7 +67,7 @@ class Population:
         """New states; `same` gives every member the same weights."""
         return [self._init(self.key, 0 if same else member) for member in range(members)]
 
-    def acting(self, states: Sequence[State]) -> list[Any]:
+    def policy_params(self, states: Sequence[State]) -> list[Any]:
         """What each member acts with, as NumPy arrays that no later update touches."""
         return [jax.tree.map(np.array, self._acting(state)) for state in states]
 
@@ -95,8 +95,8 @@ class Population:
     ) -> list[str]:
         """Names of the columns of losses, in order; of rows only the shape matters."""
         if rows is None:
-            rows = np.zeros((self.algorithm.cycle, 1, self.columns.width), np.float32)
-        size = self.columns.observation
+            rows = np.zeros((self.algorithm.updates_per_call, 1, self.layout.width), np.float32)
+        size = self.layout.spec.observation_size
         statistics = (np.zeros(size), np.ones(size))
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
@@ -140,12 +140,13 @@ class Population:
         update = self.algorithm.update(state, batch, whole)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
-        acting = jax.tree.map(jnp.copy, self.algorithm.acting(update.state))
-        return update.state, losses, update.error, acting
+        acting = jax.tree.map(jnp.copy, self.algorithm.policy_params(update.state))
+        return update.state, losses, update.td_error, acting
 
     def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
-        batch = self.columns.unpack(rows, weight)
+        batch = self.layout.unpack(rows)
         return batch._replace(
+            weight=jnp.ones(rows.shape[:-1]) if weight is None else weight,
             observation=self._scale(batch.observation, statistics),
             next_observation=self._scale(batch.next_observation, statistics),
         )
@@ -155,33 +156,6 @@ class Population:
             return observation
         mean, deviation = statistics
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-
-
-def inherit(states: Sequence[Any], parents: Parents, copy: str) -> list[Any]:
-    """Each member's new state; who is its own parent goes on as it is. Of another parent, `full`
-    copies everything, `weights` leaves a member its own optimiser, and `actor` gives it only the
-    parent's actor, as its target too, with fresh Adam moments and the noise that fits it.
-    """
-    return [
-        own if parent == member else _descend(own, states[parent], copy)
-        for member, (own, parent) in enumerate(zip(states, parents, strict=True))
-    ]
-
-
-def _descend(own: Any, parent: Any, copy: str) -> Any:
-    if copy == "full":
-        new = parent
-    elif copy == "weights":
-        kept = [f for f in own._fields if f.endswith("_optimizer") or f == "updates"]
-        new = parent._replace(**{field: getattr(own, field) for field in kept})
-    else:
-        fresh = jax.tree.map(jnp.zeros_like, own.actor_optimizer)
-        new = own._replace(actor=parent.actor, actor_optimizer=fresh)
-        if "target_actor" in own._fields:
-            new = new._replace(target_actor=parent.actor)
-        if "sigma" in own._fields:
-            new = new._replace(sigma=parent.sigma)
-    return jax.tree.map(jnp.copy, new)  # updates use up their state, so no two may share a buffer
 
 
 def _key(key: Array, draw: Draw, cycle: Any, member: Any) -> Array:

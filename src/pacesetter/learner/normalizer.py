@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from pacesetter.policy import Floats
+from pacesetter.types import Floats
 
 Statistics = tuple[Floats, Floats]
 

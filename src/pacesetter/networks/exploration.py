@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import AfterValidator, ValidationInfo
 
 from pacesetter.networks import mlp
-from pacesetter.policy import Floats, Layers, forward
+from pacesetter.policy import forward
+from pacesetter.types import Floats, Layers
 
 OU_PULL = 0.15
 SPARSE_CHANCE = 0.05
@@ -18,12 +19,12 @@ ADAPT_FACTOR = 1.01
 SIGMA_RANGE = (1e-4, 1.0)  # where tanh saturates, distance no longer tells of sigma
 NOISY = ("kernel", "bias")  # and not the gains of layer norm
 Array = jax.Array
-Draw = np.random.Generator
+Rng = np.random.Generator
 
 
 def _fits_all_layers(kind: str, info: ValidationInfo) -> str:
     if kind == "parameter" and not info.data.get("actor_layer_norm"):
-        raise ValueError("needs --actor-layer-norm, so that one deviation fits all layers")
+        raise ValueError("needs --actor-layer-norm, so that one sigma fits all layers")
     return kind
 
 
@@ -31,42 +32,47 @@ Kind = Annotated[Literal["gaussian", "ou", "sparse", "parameter"], AfterValidato
 
 
 class Exploration(NamedTuple):
-    """`begin(acting, size, rng) -> memory` at an episode's start; then, a step,
-    `act(acting, memory, observation, scale, rng) -> (action, memory)`.
+    """One way to explore.
+
+    `params` are the actor and `state`, what this way adapts as it learns: () for most.
+    `start_episode(params, size, rng)` makes the noise state of an episode, and
+    `act(params, noise_state, observation, scale, rng)` an action (A,) and the next noise state.
     """
 
-    begin: Callable[[Any, int, Draw], Any]
-    act: Callable[[Any, Any, Floats, float, Draw], tuple[Floats, Any]]
+    start_episode: Callable[[Any, int, Rng], Any]
+    act: Callable[[Any, Any, Floats, float, Rng], tuple[Floats, Any]]
+    init: Callable[[float], Any] = lambda scale: ()
 
 
-def _normal(shape: tuple[int, ...], scale: float, rng: Draw) -> Floats:
+def _normal(shape: tuple[int, ...], scale: float, rng: Rng) -> Floats:
     return np.float32(scale) * rng.standard_normal(shape, np.float32)
 
 
 def _gaussian(
-    actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
+    params: Any, noise_state: Any, observation: Floats, scale: float, rng: Rng
 ) -> tuple[Floats, Any]:
-    action: Floats = np.tanh(forward(actor, observation))
-    return action + _normal(action.shape, scale, rng), memory
+    action: Floats = np.tanh(forward(params[0], observation))
+    return action + _normal(action.shape, scale, rng), noise_state
 
 
 def _ou(
-    actor: Layers, memory: Floats, observation: Floats, scale: float, rng: Draw
+    params: Any, noise_state: Floats, observation: Floats, scale: float, rng: Rng
 ) -> tuple[Floats, Any]:
-    moved = np.add((1 - OU_PULL) * memory, _normal(memory.shape, scale, rng), dtype=np.float32)
-    return np.tanh(forward(actor, observation)) + moved, moved
+    draw = _normal(noise_state.shape, scale, rng)
+    noise = np.add((1 - OU_PULL) * noise_state, draw, dtype=np.float32)
+    return np.tanh(forward(params[0], observation)) + noise, noise
 
 
 def _sparse(
-    actor: Layers, memory: Any, observation: Floats, scale: float, rng: Draw
+    params: Any, noise_state: Any, observation: Floats, scale: float, rng: Rng
 ) -> tuple[Floats, Any]:
-    before = forward(actor, observation)
+    before = forward(params[0], observation)
     chosen = rng.random(before.shape) < SPARSE_CHANCE
-    return np.tanh(before + _normal(before.shape, scale, rng) * chosen), memory
+    return np.tanh(before + _normal(before.shape, scale, rng) * chosen), noise_state
 
 
-def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:
-    actor, sigma = acting
+def _noisy_actor(params: tuple[Layers, Any], size: int, rng: Rng) -> Layers:
+    actor, sigma = params
 
     def noisy(value: Floats) -> Floats:
         return value + _normal(value.shape, sigma, rng)
@@ -78,32 +84,50 @@ def _noisy_actor(acting: tuple[Layers, Any], size: int, rng: Draw) -> Layers:
 
 
 def _by_noisy_actor(
-    acting: Any, memory: Layers, observation: Floats, scale: float, rng: Draw
+    params: Any, noise_state: Layers, observation: Floats, scale: float, rng: Rng
 ) -> tuple[Floats, Any]:
-    return np.tanh(forward(memory, observation)), memory
-
-
-KINDS = {
-    "gaussian": Exploration(lambda acting, size, rng: (), _gaussian),
-    # Ornstein-Uhlenbeck with theta 0.15 and unit time step (Lillicrap et al. 2016, section 7).
-    "ou": Exploration(lambda acting, size, rng: np.zeros(size, np.float32), _ou),
-    # STEVE (Buckman et al. 2018): noise before the tanh, on each number with a chance of 5%.
-    "sparse": Exploration(lambda acting, size, rng: (), _sparse),
-    # Plappert et al. 2018: one actor with noisy weights acts a whole episode, without other noise.
-    "parameter": Exploration(_noisy_actor, _by_noisy_actor),
-}
+    return np.tanh(forward(noise_state, observation)), noise_state
 
 
 def first_sigma(goal: float) -> Array:
-    """Deviation of the weights' noise at the start: the goal itself."""
+    """Standard deviation of the weights' noise at the start: the goal itself."""
     return jnp.clip(jnp.asarray(goal, jnp.float32), *SIGMA_RANGE)
+
+
+KINDS = {
+    "gaussian": Exploration(lambda params, size, rng: (), _gaussian),
+    # Ornstein-Uhlenbeck with theta 0.15 and unit time step (Lillicrap et al. 2016, section 7).
+    "ou": Exploration(lambda params, size, rng: np.zeros(size, np.float32), _ou),
+    # STEVE (Buckman et al. 2018): noise before the tanh, on each number with a chance of 5%.
+    "sparse": Exploration(lambda params, size, rng: (), _sparse),
+    # Plappert et al. 2018: one actor with noisy weights acts a whole episode, without other noise.
+    "parameter": Exploration(_noisy_actor, _by_noisy_actor, first_sigma),
+}
+
+
+def adapt(
+    learner: Any, state: Any, observation: Array, keys: Array
+) -> tuple[Any, dict[str, Array]]:
+    """A learner's state with parameter noise adapted, if a multiple of 50 updates has passed, and
+    what to log of it; other kinds have nothing to adapt.
+    """
+    sigma, goal = state.exploration, learner.hyper.exploration_noise
+    if learner.hyper.exploration != "parameter":
+        return state, {}
+    sigma = jax.lax.cond(
+        state.updates % ADAPT_EVERY < learner.updates_per_call,
+        lambda sigma: adapt_sigma(sigma, state.actor, goal, observation, keys[-1]),
+        lambda sigma: sigma,
+        sigma,
+    )
+    return state._replace(exploration=sigma), {"sigma": sigma}
 
 
 def adapt_sigma(
     sigma: Array, actor: mlp.Network, goal: float, observation: Array, key: Array
 ) -> Array:
-    """Sigma moved 1% towards where noisy actions are `goal` from clean ones (Plappert et al. 2018,
-    appendix C), on a batch of observations (B, O) and with a noisy copy drawn for this alone.
+    """Move sigma by 1% so that perturbed actions lie `goal` from unperturbed ones (Plappert et al.
+    2018, appendix C), on a batch of observations (B, O) and with a perturbed copy for this alone.
     """
     apart = mlp.actor(perturb(actor, sigma, key), observation) - mlp.actor(actor, observation)
     distance = jnp.sqrt((apart**2).mean())

@@ -72,7 +72,7 @@ def hidden_layer(layer: Layer, x: Array, activation: Callable[[Array], Array]) -
 
 @jax.custom_vjp
 def standardize(x: Array) -> Array:
-    """Rows (..., n) less their mean, over their deviation (Ba et al. 2016).
+    """Vectors (..., n) less their mean, over their standard deviation (Ba et al. 2016).
 
     As jax.nn.standardize; the gradient in closed form makes updates of networks with layer norm
     2 to 10% quicker.
@@ -110,7 +110,7 @@ def actor(network: Network, observation: Array) -> Array:
 
 
 def outputs(network: Network, observation: Array, action: Array, action_layer: int = 0) -> Array:
-    """What a critic says (..., outputs) of an action, which joins at `action_layer`."""
+    """A critic's outputs (..., outputs) for an action, which joins at `action_layer`."""
     x = observation
     for layer in network[:action_layer]:
         x = hidden_layer(layer, x, jax.nn.relu)
@@ -131,9 +131,9 @@ def apart(count: int, inputs: Any) -> Any:
     return jax.lax.optimization_barrier(jax.tree.map(lambda x: jnp.stack([x] * count), inputs))
 
 
-def descend(
-    optimizer: optax.GradientTransformation, parameters: Any, gradient: Any, moments: Any
+def apply_gradient(
+    optimizer: optax.GradientTransformation, params: Any, gradient: Any, opt_state: Any
 ) -> tuple[Any, Any]:
-    """One optimiser step: the moved parameters and the new moments."""
-    change, moments = optimizer.update(gradient, moments, parameters)
-    return optax.apply_updates(parameters, change), moments
+    """One optimiser step: the new parameters and optimiser state."""
+    change, opt_state = optimizer.update(gradient, opt_state, params)
+    return optax.apply_updates(params, change), opt_state

@@ -11,28 +11,28 @@ from pacesetter.networks import mlp
 
 
 class Gaussian(NamedTuple):
-    """A policy: a tanh network of the mean (A,), and a log deviation (A,) that sees nothing."""
+    """A policy: a tanh network of the mean (A,), and a log standard deviation (A,) of its own."""
 
     network: mlp.Network
     log_std: Array
 
 
-# A diagonal Gaussian: its mean (B, A) and log deviation (A,).
-Moments = tuple[Array, Array]
+# A diagonal Gaussian: its mean (B, A) and log standard deviation (A,).
+Distribution = tuple[Array, Array]
 
 
-def moments(actor: Gaussian, observation: Array) -> Moments:
+def distribution_of(actor: Gaussian, observation: Array) -> Distribution:
     return mlp.apply(actor.network, observation, jnp.tanh), actor.log_std
 
 
-def log_probability(moments: Moments, action: Array) -> Array:
-    """log pi (B,) of actions (B, A), which are not cut."""
-    mean, log_std = moments
+def log_probability(distribution: Distribution, action: Array) -> Array:
+    """log pi (B,) of actions (B, A), which are not clipped."""
+    mean, log_std = distribution
     distance = (action - mean) * jnp.exp(-log_std)
     return -(0.5 * distance**2 + log_std + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=-1)
 
 
-def kl(old: Moments, new: Moments) -> Array:
+def kl(old: Distribution, new: Distribution) -> Array:
     """Mean over B of KL(old || new)."""
     (old_mean, old_log_std), (mean, log_std) = old, new
     squares = jnp.exp(2 * old_log_std) + (old_mean - mean) ** 2
@@ -41,12 +41,12 @@ def kl(old: Moments, new: Moments) -> Array:
 
 
 def fisher_product(
-    distribution: Callable[[Array], Moments], parameters: Array
+    distribution: Callable[[Array], Distribution], parameters: Array
 ) -> Callable[[Array], Array]:
     """v -> Fv, where F is the Hessian of the mean KL from `parameters` to themselves.
 
-    F = J'MJ exactly, with J the Jacobian of mean and log deviation, and M the Fisher matrix of a
-    Gaussian in those, which is diagonal: 1 / std^2 and 2.
+    F = J'MJ exactly, with J the Jacobian of mean and log standard deviation, and M the Fisher
+    matrix of a Gaussian in those, which is diagonal: 1 / std^2 and 2.
     """
     (mean, log_std), jacobian = jax.linearize(distribution, parameters)
     transposed = jax.linear_transpose(jacobian, parameters)

@@ -9,63 +9,18 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from pacesetter.algorithms.contract import Array, Batch
+from pacesetter.batch import Layout, Transition
 from pacesetter.errors import UsageError
-from pacesetter.policy import Floats
-from pacesetter.replay.sampler import Drawing, Numbers, Uniform
-from pacesetter.storage import Arrays, digest
+from pacesetter.replay.sampler import Drawing, Uniform
+from pacesetter.storage import digest
+from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
 MEMBERS = 1_000  # at most, each of which may add n_step rows before the next checkpoint
 SLACK = 2 * (UNCOMMITTED + MEMBERS) + BLOCK
-
-
-class Columns(NamedTuple):
-    """Where each part of a transition stands in a row."""
-
-    observation: int
-    action: int
-    masks: int = 0
-
-    @property
-    def width(self) -> int:
-        return 2 * self.observation + self.action + 3 + self.masks
-
-    def pack(
-        self,
-        observation: Floats,
-        action: Floats,
-        reward: float,
-        following: Floats,
-        discount: float,
-        last: bool,
-        mask: Floats,
-    ) -> Floats:
-        """The row (width,) of a transition; `following` is what step() returned, never a reset
-        observation."""
-        parts = (observation, action, [reward], following, [discount, last], mask)
-        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
-
-    def unpack(self, rows: Array, weight: Array | None) -> Batch:
-        """Rows (..., width) as a batch; without weights all count 1."""
-        ends = np.cumsum([self.observation, self.action, 1, self.observation, 1, 1])
-        observation, action, reward, following, discount, last, mask = jnp.split(
-            rows, ends, axis=-1
-        )
-        return Batch(
-            observation,
-            action,
-            reward[..., 0],
-            following,
-            discount[..., 0],
-            last[..., 0],
-            weight=jnp.ones(rows.shape[:-1]) if weight is None else weight,
-            mask=mask,
-        )
 
 
 class Sample(NamedTuple):
@@ -82,7 +37,7 @@ class Replay:
     def __init__(
         self,
         path: Path,
-        columns: Columns,
+        layout: Layout,
         capacity: int,
         budget: int,
         drawing: Drawing | None = None,
@@ -90,16 +45,16 @@ class Replay:
     ) -> None:
         """`tick` is how many rows a tick adds at most."""
         self.tick = MEMBERS if tick is None else tick
-        self.path, self.columns, self.capacity = path, columns, capacity
+        self.path, self.layout, self.capacity = path, layout, capacity
         self.drawing = drawing or Uniform()
         self.slots = capacity + SLACK
         self.head = 0  # rows added so far
         self.committed = 0  # rows that the latest checkpoint covers
         self.hashes: list[str] = []  # of each complete block since the first row
-        self._map = _map_file(path, min(self.slots, budget) * columns.width * 4)
-        count = len(self._map) // (4 * columns.width)
-        flat = np.frombuffer(self._map, np.float32, count * columns.width)
-        self.rows: Floats = flat.reshape(count, columns.width)
+        self._map = _map_file(path, min(self.slots, budget) * layout.width * 4)
+        count = len(self._map) // (4 * layout.width)
+        flat = np.frombuffer(self._map, np.float32, count * layout.width)
+        self.rows: Floats = flat.reshape(count, layout.width)
 
     def __len__(self) -> int:
         return min(self.head, self.capacity)
@@ -114,24 +69,9 @@ class Replay:
         """Whether more rows would eat into what the checkpoint before the latest needs."""
         return self.head - self.committed + self.tick >= UNCOMMITTED + MEMBERS
 
-    def add(
-        self,
-        observation: Floats,
-        action: Floats,
-        reward: float,
-        following: Floats,
-        discount: float,
-        last: bool,
-        mask: Floats,
-        earned: float = 0.0,
-        member: int = 0,
-    ) -> None:
-        """Store one transition; `following` is what step() returned, never a reset observation.
-
-        `earned` is what the member's episode had returned before it.
-        """
-        row = self.columns.pack(observation, action, reward, following, discount, last, mask)
-        self.append(row, earned, member)
+    def add(self, transition: Transition, member: int = 0) -> None:
+        """Store one transition of a member."""
+        self.append(self.layout.pack(transition), transition.earned or 0.0, member)
 
     def append(self, row: Floats, earned: float = 0.0, member: int = 0) -> None:
         """Store one transition that is packed already."""
@@ -141,7 +81,7 @@ class Replay:
 
     def padded(self, size: int) -> Floats:
         """The window as rows (size, width): row n of the run at n % size, zeros where none is."""
-        rows = np.zeros((size, self.columns.width), np.float32)
+        rows = np.zeros((size, self.layout.width), np.float32)
         numbers = np.array(self.window[-size:])
         rows[numbers % size] = self.rows[numbers % self.slots]
         return rows
@@ -163,7 +103,7 @@ class Replay:
         """Put all rows on disk; what a checkpoint must know to find and verify them again."""
         page = mmap.ALLOCATIONGRANULARITY
         for start, stop in self._spans(self.committed, self.head):
-            first, end = (row * self.columns.width * 4 for row in (start, stop))
+            first, end = (row * self.layout.width * 4 for row in (start, stop))
             first -= first % page
             self._map.flush(first, min(end - first, len(self._map) - first))
         for block in range(len(self.hashes), self.head // BLOCK):

@@ -4,9 +4,8 @@ from collections import deque
 
 import numpy as np
 
-from pacesetter.policy import Floats
-from pacesetter.replay.sampler import Drawn, Numbers, Reals, Shape, weigh
-from pacesetter.storage import Arrays
+from pacesetter.replay.sampler import Drawn, weigh
+from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 FLOOR = 0.05  # added to a rank, so that no row is lost
 MIDDLE = 0.5  # rank of what has none yet

@@ -1,28 +1,11 @@
 """Rows that reach over several steps, built for each member as its steps come in."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from pacesetter.policy import Floats
-from pacesetter.storage import Arrays
-
-
-class Transition(NamedTuple):
-    """One row before it is packed, in the order of `Replay.add`.
-
-    Over m steps: the first's observation, action, mask and `earned`, what the episode had earned
-    before it; the discounted sum of rewards; where the last step led, and gamma**m, or 0.
-    """
-
-    observation: Floats
-    action: Floats
-    reward: float
-    following: Floats
-    discount: float
-    last: bool
-    mask: Floats
-    earned: float
+from pacesetter.batch import Transition
+from pacesetter.types import Arrays
 
 
 class Pending:
@@ -48,22 +31,21 @@ class Pending:
 
     def arrays(self) -> Arrays:
         """The waiting rows, field by field."""
-        fields = zip(*self.rows, strict=True)
-        return {
-            name: np.array(values) for name, values in zip(Transition._fields, fields, strict=False)
-        }
+        fields = zip(Transition._fields, zip(*self.rows, strict=True), strict=False)
+        return {name: np.array(values) for name, values in fields if values[0] is not None}
 
     def restore(self, arrays: Arrays) -> None:
         """The inverse of `arrays`."""
-        columns: list[Any] = [arrays[name] for name in Transition._fields if name in arrays]
-        self.rows = [Transition(*row) for row in zip(*columns, strict=True)]
+        columns: list[Any] = list(arrays.values())
+        rows = zip(*columns, strict=True)
+        self.rows = [Transition(**dict(zip(arrays, row, strict=True))) for row in rows]
 
 
 def _extend(row: Transition, step: Transition) -> Transition:
     """A row with one more step, seen from where it led; only its own end would make that 0."""
     return row._replace(
         reward=row.reward + row.discount * step.reward,
-        following=step.following,
+        next_observation=step.next_observation,
         discount=row.discount * step.discount,
         last=step.last,
     )

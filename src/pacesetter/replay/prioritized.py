@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pacesetter.policy import Floats
-from pacesetter.replay.sampler import Drawn, Numbers, Reals, Shape, weigh
-from pacesetter.storage import Arrays
+from pacesetter.replay.sampler import Drawn, weigh
+from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 BLOCK = 32  # priorities that are summed together
 REFRESH = 250  # updates after which the priority of new rows is measured anew (TD7)

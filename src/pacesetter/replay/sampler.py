@@ -7,14 +7,8 @@ numbers from the window, takes the errors of an update and goes to the checkpoin
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pacesetter.policy import Floats
-from pacesetter.storage import Arrays
-
-Numbers = NDArray[np.int64]
-Reals = NDArray[np.float64]
-Shape = tuple[int, ...]
+from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 
 class Drawn(NamedTuple):

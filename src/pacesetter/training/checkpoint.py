@@ -14,8 +14,9 @@ from pacesetter.envs import Snapshot
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, threads
-from pacesetter.storage import Arrays, Content
+from pacesetter.storage import Content
 from pacesetter.training.on_policy import Iterations
+from pacesetter.types import Arrays
 
 KIND = "checkpoint"
 SCHEMA = 3
@@ -106,7 +107,7 @@ def _restore(ensemble: Learning, directory: RunDirectory, file: Path, notes: lis
     except storage.FAULTS as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
     ensemble.states, ensemble.memory, ensemble.kept = states, memory, kept
-    ensemble.acting = ensemble.population.acting(states)
+    ensemble.acting = ensemble.population.policy_params(states)
     if not directory.cut_log(int(table["log"])):
         notes.append(f"{directory.metrics_file}: rows of the log are missing")
     if table["threads"] != threads() and ensemble.progress.step < ensemble.budget:

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.algorithms.contract import Algorithm, Spec
+from pacesetter.algorithms.contract import Learner
+from pacesetter.batch import Layout, Spec, Transition
 from pacesetter.config import Config
 from pacesetter.dynamics import known_rewards
 from pacesetter.ensemble.progress import Progress
@@ -22,12 +23,13 @@ from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, blame
 from pacesetter.learner.compiled import Population
 from pacesetter.learner.normalizer import Normalizer, Statistics
-from pacesetter.policy import Floats, Policy, clip, normalize
-from pacesetter.replay.buffer import Columns, Replay
+from pacesetter.policy import Policy, clip, normalize
+from pacesetter.replay.buffer import Replay
 from pacesetter.replay.n_step import Pending
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings import ModelDriven
 from pacesetter.training.sources import AllSteps, LastRollout
+from pacesetter.types import Floats
 
 
 class Iterations:
@@ -43,22 +45,22 @@ class Iterations:
         build = algorithms.find(run.algorithm).build
         if isinstance(hyper, ModelDriven) and hyper.known:
             build = partial(build, known=known_rewards.of(run.env, run.env_kwargs))
-        self.algorithm: Algorithm = build(spec, hyper)
+        self.algorithm: Learner = build(spec, hyper)
         self.streams = [generator(run.seed, Stream.ACT, k) for k in range(len(envs))]
-        self.columns = Columns(*spec)
+        self.layout = Layout(spec)
         self.population = Population(
-            self.algorithm, self.columns, run.seed, hyper.normalize_observation
+            self.algorithm, self.layout, run.seed, hyper.normalize_observation
         )
         self.states = self.population.init(1, same=False)
-        self.acting = self.population.acting(self.states)
+        self.acting = self.population.policy_params(self.states)
         source = AllSteps if isinstance(hyper, ModelDriven) else LastRollout
-        self.source: AllSteps | LastRollout = source(config, self.columns)
+        self.source: AllSteps | LastRollout = source(config, self.layout)
         self.loss_names = self.population.loss_names(self.states[0], *self.source.shape())
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps
         self.pending: list[Pending] = []
         self.kept: list[Policy | None] = [None]  # nothing is assessed
-        self.memory = [self.algorithm.begin(self.acting[0], rng) for rng in self.streams]
+        self.memory = [self.algorithm.start_episode(self.acting[0], rng) for rng in self.streams]
         self.progress = Progress.of(len(envs))
 
     def open_replays(self, folder: Path) -> None:
@@ -113,7 +115,7 @@ class Iterations:
 
     def collect(self, steps: int) -> Floats:
         """Rows (steps, width) of that many steps, the envs in turn."""
-        rows = np.empty((steps, self.columns.width), np.float32)
+        rows = np.empty((steps, self.layout.width), np.float32)
         statistics = self.statistics
         for i in range(steps):
             k = i % len(self.envs)
@@ -127,7 +129,7 @@ class Iterations:
         if member.starting:
             env.reset()
             member.start(progress.step)
-            self.memory[k] = self.algorithm.begin(self.acting[0], self.streams[k])
+            self.memory[k] = self.algorithm.start_episode(self.acting[0], self.streams[k])
         before = seen = env.observation
         if self.population.normalize:
             seen = normalize(before, *statistics)
@@ -145,8 +147,8 @@ class Iterations:
             member.starting = True
         discount = self.config.hyper.gamma * (1.0 - step.terminated)
         mask = np.zeros(0, np.float32)
-        return self.columns.pack(
-            before, action, step.reward, step.observation, discount, step.ended, mask
+        return self.layout.pack(
+            Transition(before, action, step.reward, step.observation, discount, step.ended, mask)
         )
 
     # Learn.
@@ -168,4 +170,4 @@ class Iterations:
         progress.transitions += int(extra.get("valid", len(rows)))
         if self.population.normalize:
             for row in rows:
-                self.normalizer.add(row[: self.columns.observation])
+                self.normalizer.add(row[: self.layout.spec.observation_size])

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 
+from pacesetter.batch import Layout
 from pacesetter.config import Config
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
-from pacesetter.policy import Floats
-from pacesetter.replay.buffer import UNCOMMITTED, Columns, Replay
+from pacesetter.replay.buffer import UNCOMMITTED, Replay
 from pacesetter.seeding import Stream
+from pacesetter.types import Floats
 
 Data = tuple[Floats, dict[str, Any]]  # rows and the batch's other fields
 FEWEST = 250  # rows, of which a fifth is held out by a fit
@@ -19,14 +20,14 @@ FEWEST = 250  # rows, of which a fifth is held out by a fit
 class LastRollout:
     """The rollout just made, in time order: (T, E, width)."""
 
-    def __init__(self, config: Config, columns: Columns) -> None:
-        self.envs, self.columns = config.hyper.parallel_envs, columns
+    def __init__(self, config: Config, layout: Layout) -> None:
+        self.envs, self.layout = config.hyper.parallel_envs, layout
         self.length = config.hyper.rollout_length
         self.replays: list[Replay] = []
 
     def shape(self) -> Data:
         """Data of the right shape."""
-        return np.zeros((self.length, self.envs, self.columns.width), np.float32), {}
+        return np.zeros((self.length, self.envs, self.layout.width), np.float32), {}
 
     def open(self, path: Path, budget: int) -> None:
         """Nothing lies in a file."""
@@ -36,7 +37,7 @@ class LastRollout:
 
     def data(self, rows: Floats, update: int) -> Data:
         """The data of an update, by its number."""
-        return rows.reshape(self.length, self.envs, self.columns.width), {}
+        return rows.reshape(self.length, self.envs, self.layout.width), {}
 
     def close(self) -> None:
         """There is nothing to let go of."""
@@ -48,9 +49,9 @@ class AllSteps:
     Starts are resets of an env of their own, each seeded by its number, so no state is kept.
     """
 
-    def __init__(self, config: Config, columns: Columns) -> None:
+    def __init__(self, config: Config, layout: Layout) -> None:
         run, hyper = config.run, config.hyper
-        self.columns, self.starts = columns, hyper.starts
+        self.layout, self.starts = layout, hyper.starts
         self.capacity = min(hyper.replay_size, run.steps)
         rollout = self.rollout = hyper.parallel_envs * hyper.rollout_length
         if not FEWEST <= rollout <= min(UNCOMMITTED, hyper.replay_size):
@@ -64,13 +65,13 @@ class AllSteps:
 
     def shape(self) -> Data:
         """Data of the right shape."""
-        rows = np.zeros((self.capacity, self.columns.width), np.float32)
-        starts = np.zeros((self.starts, self.columns.observation), np.float32)
+        rows = np.zeros((self.capacity, self.layout.width), np.float32)
+        starts = np.zeros((self.starts, self.layout.spec.observation_size), np.float32)
         return rows, {"starts": starts, "valid": 0}
 
     def open(self, path: Path, budget: int) -> None:
         """Make or find the ring."""
-        self.replays.append(Replay(path, self.columns, self.size, budget, tick=self.rollout))
+        self.replays.append(Replay(path, self.layout, self.size, budget, tick=self.rollout))
 
     def keep(self, rows: Floats) -> None:
         """Put a rollout into the ring."""

@@ -1,0 +1,57 @@
+"""What learners with a deterministic actor share: how they act, explore and copy one another."""
+
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pacesetter.algorithms.contract import Learner
+from pacesetter.networks import exploration, mlp
+from pacesetter.policy import Actors
+from pacesetter.types import Floats
+
+
+class DeterministicLearner(Learner):
+    """Defaults for TD3 and its kin.
+
+    Their states have `actor`, `target_actor` and `critic`, an optimiser state of each network that
+    learns, `updates`, and `exploration`: what the exploration adapts, () for most kinds.
+    """
+
+    @cached_property
+    def exploration(self) -> exploration.Exploration:
+        """How it explores."""
+        return exploration.KINDS[self.hyper.exploration]
+
+    def policy_params(self, state: Any) -> tuple[mlp.Network, Any]:
+        return state.actor, state.exploration
+
+    def start_episode(self, params: Any, rng: np.random.Generator) -> Any:
+        return self.exploration.start_episode(params, self.spec.action_size, rng)
+
+    def act(
+        self, params: Any, noise_state: Any, observation: Floats, rng: np.random.Generator
+    ) -> tuple[Floats, Any]:
+        scale = self.hyper.exploration_noise
+        return self.exploration.act(params, noise_state, observation, scale, rng)
+
+    def policy(self, state: Any) -> Actors:
+        one = jax.tree.map(lambda x: x[None], state.actor)
+        return Actors(one, activation="relu", output="tanh")
+
+    def copy_weights(self, own: Any, parent: Any) -> Any:
+        return parent._replace(
+            actor_opt_state=own.actor_opt_state,
+            critic_opt_state=own.critic_opt_state,
+            updates=own.updates,
+        )
+
+    def copy_actor(self, own: Any, parent: Any) -> Any:
+        return own._replace(
+            actor=parent.actor,
+            target_actor=parent.actor,
+            actor_opt_state=jax.tree.map(jnp.zeros_like, own.actor_opt_state),
+            exploration=parent.exploration,
+        )
