@@ -4,8 +4,9 @@ One critic, no delay, no noise on the target action; everything else is TD3's. T
 `ddpg-original` sets what differs in Lillicrap et al. 2016; without batch normalisation.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Annotated, ClassVar
 
 import optax
@@ -40,8 +41,9 @@ class DDPG(td3.TD3):
 
     Hyper: ClassVar[type] = Hyper
 
-    def critic_outputs(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
-        return mlp.outputs(critic, observation, action, self.hyper.action_layer)
+    @cached_property
+    def critic_network(self) -> Callable[[mlp.Network, Array, Array], Array]:
+        return partial(mlp.outputs, action_layer=self.hyper.action_layer)
 
     def new_actor(self, key: Array) -> mlp.Network:
         (observation, action), hyper = self.spec, self.hyper
@@ -55,8 +57,8 @@ class DDPG(td3.TD3):
         sizes = (observation, hyper.hidden, self.head.outputs)
         return new(key, *sizes, joins=(hyper.action_layer, action))
 
-    @property
+    @cached_property
     def critic_optimizer(self) -> optax.GradientTransformation:
-        adam = super().critic_optimizer
+        adam = optax.adam(self.hyper.critic_learning_rate)
         decay = self.hyper.critic_decay
         return optax.chain(optax.add_decayed_weights(decay), adam) if decay else optax.chain(adam)

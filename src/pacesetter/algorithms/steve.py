@@ -140,7 +140,7 @@ class Expansion(td3.TD3):
         """The mean value (B,) by the first critic of every member."""
         firsts = range(0, self.critic_count, self.hyper.critics)
         ones = [jax.tree.map(lambda x, i=i: x[i], critic) for i in firsts]
-        outputs = [self.critic_outputs(one, observation, action) for one in ones]
+        outputs = [self.critic_network(one, observation, action) for one in ones]
         values = [self.head.value(each) for each in outputs]
         return sum(values[1:], values[0]) / len(values)
 

@@ -157,8 +157,7 @@ class Sunrise(Learner):
 
     def values_of_all(self, critic: Any, observation: Array, action: Array) -> tuple[Array, Array]:
         """Values of each one's own action (N, critics, B), and of all by all (N, critics, N, B)."""
-        everyone = jax.vmap(self.base.values)
-        values = [everyone(critic, *mlp.apart(len(action), (observation, one))) for one in action]
+        values = [mlp.each(self.base.values, critic, observation, one) for one in action]
         own = jnp.stack([value[i] for i, value in enumerate(values)])
         return own, jnp.stack(values, axis=2)
 

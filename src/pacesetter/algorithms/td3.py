@@ -7,6 +7,7 @@ move the actor up critic 1 on the last minibatch
 move all targets a little towards their networks
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -17,7 +18,7 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
+from pacesetter.algorithms.contract import Array, Update, each_minibatch
 from pacesetter.algorithms.deterministic import DeterministicLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import critic_heads, mlp
@@ -38,9 +39,7 @@ class Hyper(ActorCritic):
     target_noise_clip: float = Field(0.5, ge=0, description="bound of the target action's noise")
     exploration: Kind = Field("gaussian", description="noise on actions, or on the actor's weights")
     exploration_noise: Annotated[float, Tune(0.05, 0.4, log=True)] = Field(
-        0.1,
-        ge=0,
-        description="standard deviation of that noise, measured on actions",
+        0.1, ge=0, description="standard deviation of that noise, measured on actions"
     )
 
 
@@ -97,13 +96,14 @@ class TD3(DeterministicLearner):
     # One update.
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
-        keys = jax.random.split(key, self.updates_per_call + 1)
+        keys = jax.random.split(key, self.hyper.policy_delay + 1)
         state, (losses, td_error) = each_minibatch(self.critic_step, state, batch, keys[:-1])
-        last = last_minibatch(batch)
+        last = jax.tree.map(lambda x: x[-1], batch)
         state, actor_loss = self.fit_actor(state, last)
-        state, found = adapt(self, state, last.observation, keys)
         losses = {name: loss.mean() for name, loss in losses.items()} | {"actor_loss": actor_loss}
-        return Update(state, losses | found, td_error)
+        if self.exploration.adapts:
+            state, losses["sigma"] = adapt(self, state, last.observation, keys[-1])
+        return Update(state, losses, td_error)
 
     def critic_step(self, state: State, batch: Batch, key: Array) -> tuple[State, Any]:
         """Move every critic towards the target of one minibatch."""
@@ -166,17 +166,18 @@ class TD3(DeterministicLearner):
     def actor_value(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """The value (B,) that the actor climbs: in TD3 the first critic's."""
         one = jax.tree.map(lambda x: x[0], critic)
-        return self.head.value(self.critic_outputs(one, observation, action))
+        return self.head.value(self.critic_network(one, observation, action))
 
     # Its networks.
 
+    @cached_property
+    def critic_network(self) -> Callable[[mlp.Network, Array, Array], Array]:
+        """The outputs (B, M) of one critic for observations and actions."""
+        return mlp.outputs
+
     def outputs(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's outputs (critics, B, M)."""
-        return mlp.each(self.critic_outputs, critic, observation, action)
-
-    def critic_outputs(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
-        """One critic's outputs (B, M)."""
-        return mlp.outputs(critic, observation, action)
+        return mlp.each(self.critic_network, critic, observation, action)
 
     def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B)."""
@@ -191,10 +192,10 @@ class TD3(DeterministicLearner):
         hyper, norm = self.hyper, self.hyper.critic_layer_norm
         return mlp.init(key, sum(self.spec), hyper.hidden, self.head.outputs, layer_norm=norm)
 
-    @property
+    @cached_property
     def actor_optimizer(self) -> optax.GradientTransformation:
         return optax.adam(self.hyper.actor_learning_rate)
 
-    @property
+    @cached_property
     def critic_optimizer(self) -> optax.GradientTransformation:
         return optax.adam(self.hyper.critic_learning_rate)

@@ -42,6 +42,7 @@ class Exploration(NamedTuple):
     start_episode: Callable[[Any, int, Rng], Any]
     act: Callable[[Any, Any, Floats, float, Rng], tuple[Floats, Any]]
     init: Callable[[float], Any] = lambda scale: ()
+    adapts: bool = False
 
 
 def _normal(shape: tuple[int, ...], scale: float, rng: Rng) -> Floats:
@@ -101,26 +102,20 @@ KINDS = {
     # STEVE (Buckman et al. 2018): noise before the tanh, on each number with a chance of 5%.
     "sparse": Exploration(lambda params, size, rng: (), _sparse),
     # Plappert et al. 2018: one actor with noisy weights acts a whole episode, without other noise.
-    "parameter": Exploration(_noisy_actor, _by_noisy_actor, first_sigma),
+    "parameter": Exploration(_noisy_actor, _by_noisy_actor, first_sigma, adapts=True),
 }
 
 
-def adapt(
-    learner: Any, state: Any, observation: Array, keys: Array
-) -> tuple[Any, dict[str, Array]]:
-    """A learner's state with parameter noise adapted, if a multiple of 50 updates has passed, and
-    what to log of it; other kinds have nothing to adapt.
-    """
-    sigma, goal = state.exploration, learner.hyper.exploration_noise
-    if learner.hyper.exploration != "parameter":
-        return state, {}
+def adapt(learner: Any, state: Any, observation: Array, key: Array) -> tuple[Any, Array]:
+    """A learner's state with sigma adapted if a multiple of 50 updates has passed, and sigma."""
+    goal = learner.hyper.exploration_noise
     sigma = jax.lax.cond(
         state.updates % ADAPT_EVERY < learner.updates_per_call,
-        lambda sigma: adapt_sigma(sigma, state.actor, goal, observation, keys[-1]),
+        lambda sigma: adapt_sigma(sigma, state.actor, goal, observation, key),
         lambda sigma: sigma,
-        sigma,
+        state.exploration,
     )
-    return state._replace(exploration=sigma), {"sigma": sigma}
+    return state._replace(exploration=sigma), sigma
 
 
 def adapt_sigma(

@@ -118,17 +118,14 @@ def outputs(network: Network, observation: Array, action: Array, action_layer: i
 
 
 def each(one: Callable[..., Any], networks: Network, *inputs: Array) -> Any:
-    """`one(network, *inputs)` of N networks, whose leaves carry a leading axis of N."""
-    return jax.vmap(one)(networks, *apart(networks[0]["kernel"].shape[0], inputs))
+    """`one(network, *inputs)` of N networks, whose leaves carry a leading axis of N.
 
-
-def apart(count: int, inputs: Any) -> Any:
-    """Inputs of their own for each of `count` networks.
-
-    From shared ones XLA makes one wide product whose result it then has to transpose, which costs
-    5% of an update.
+    Each gets inputs of its own: from shared ones XLA makes one wide product whose result it then
+    has to transpose, which costs 5% of an update.
     """
-    return jax.lax.optimization_barrier(jax.tree.map(lambda x: jnp.stack([x] * count), inputs))
+    count = networks[0]["kernel"].shape[0]
+    own = jax.lax.optimization_barrier([jnp.stack([x] * count) for x in inputs])
+    return jax.vmap(one)(networks, *own)
 
 
 def apply_gradient(
