@@ -186,10 +186,7 @@ def test_updates_stay_in_the_trust_region(updated: Any) -> None:
         assert update.losses["surrogate"] > 0
     first, last = updated[0][0].actor, updated[-1][2].state.actor
     observation = jnp.zeros((1, 3))
-    rise = (
-        trust_region.distribution_of(last, observation)[0]
-        - trust_region.distribution_of(first, observation)[0]
-    )
+    before, after = (trust_region.distribution_of(each, observation)[0] for each in (first, last))
     assert (after - before > 0.3).all()  # larger actions pay more
 
 
