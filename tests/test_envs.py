@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 from broken_envs import Restless
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.envs import Environment, known, make
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts

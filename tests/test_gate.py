@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from pacesetter import algorithms
-from pacesetter.batch import Spec
+from pacesetter.batch import Layout, Spec
 from pacesetter.config import settle
 from pacesetter.learner.backend import IN_PLACE, compiler_options, prepare
 from pacesetter.learner.compiled import Population
-from pacesetter.replay.buffer import Columns
 from pacesetter.training.trainer import Trainer
 
 HALF_CHEETAH = Spec(17, 6)
@@ -28,10 +27,10 @@ def costs(name: str) -> dict[str, float]:
     """XLA's own count for one compiled cycle, by update."""
     config = settle(name, "HalfCheetah-v5")
     algorithm = algorithms.find(name).build(HALF_CHEETAH, config.hyper)
-    columns = Columns(*HALF_CHEETAH)
-    population = Population(algorithm, columns, 0, normalize=False)
+    layout = Layout(HALF_CHEETAH)
+    population = Population(algorithm, layout, 0, normalize=False)
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
-    rows = jax.ShapeDtypeStruct((algorithm.updates_per_call, 256, columns.width), np.float32)
+    rows = jax.ShapeDtypeStruct((algorithm.updates_per_call, 256, layout.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
     key = np.zeros(2, np.uint32)
     lowered = population._update.lower(state, rows, None, still, {}, key)

@@ -11,8 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.cli.main import main
 from pacesetter.envs import make
 from pacesetter.errors import UsageError

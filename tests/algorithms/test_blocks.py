@@ -5,15 +5,15 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import KEY, member, perceptron, quantile_loss, random_batch, random_state
+from numeric import KEY, SPEC, member, perceptron, quantile_loss, random_batch, random_state
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms import sac, td3
-from pacesetter.batch import Spec
+from pacesetter.algorithms import td3
+from pacesetter.algorithms.sac import SAC
+from pacesetter.algorithms.td3 import TD3
 from pacesetter.networks import critic_heads
 from pacesetter.settings import STRICT
 
-SPEC = Spec(observation_size=3, action_size=2)
 DISTRIBUTION = np.arange(1.0, 6.0)
 
 
@@ -70,17 +70,17 @@ def test_a_certain_return_is_a_distribution_of_one_number(rng: np.random.Generat
     np.testing.assert_array_equal(one, other)
 
 
-def test_least_is_the_whole_distribution_of_the_lower_twin() -> None:
+def test_min_q_is_the_whole_distribution_of_the_lower_twin() -> None:
     """Row by row, by the mean alone: neither number by number nor the twin with the least one."""
     outputs = np.array([[[0.0, 10], [5, 5]], [[4, 5], [-20, 40]]])
-    found = critic_heads.choose(2, "uniform").least(outputs)
-    np.testing.assert_array_equal(found, [[4, 5], [5, 5]])
+    found = critic_heads.choose(2, "uniform").min_q(outputs)
+    np.testing.assert_array_equal(found.T, [[4, 5], [5, 5]])
 
 
-def test_least_of_single_outputs_is_their_minimum(rng: np.random.Generator) -> None:
+def test_min_q_of_single_outputs_is_their_minimum(rng: np.random.Generator) -> None:
     outputs = rng.normal(size=(3, 8, 1)).astype(np.float32)
     for head in (critic_heads.choose(0, "uniform"), critic_heads.choose(1, "uniform")):
-        np.testing.assert_array_equal(head.least(outputs), outputs[..., 0].min(axis=0))
+        np.testing.assert_array_equal(head.min_q(outputs), outputs[..., 0].min(axis=0))
 
 
 def test_loss_of_lap() -> None:
@@ -99,8 +99,15 @@ def test_heads_by_the_settings() -> None:
     assert critic_heads.choose(0, "uniform").loss is critic_heads.squared
     assert critic_heads.choose(0, "prioritized").loss is critic_heads.squared
     assert critic_heads.choose(0, "lap").loss is critic_heads.lap
-    assert critic_heads.choose(25, "uniform").loss is critic_heads.quantile_huber
     assert critic_heads.choose(25, "uniform").outputs == 25
+
+
+def test_head_of_quantiles_has_their_loss(rng: np.random.Generator) -> None:
+    """For a target as `min_q` leads to it, which is (M, B)."""
+    outputs, target = rng.normal(size=(2, 4, 5)), rng.normal(size=(5, 4))
+    found = critic_heads.choose(5, "uniform").loss(outputs, target)
+    expected = critic_heads.quantile_huber(outputs, target.T)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -113,7 +120,7 @@ class LapHyper(td3.Hyper):
 def test_lap_in_a_learner(rng: np.random.Generator) -> None:
     """The critics' loss is LAP's, weighted; the replay is told the larger twin's error."""
     with jax.enable_x64(True):
-        learner = td3.TD3(SPEC, LapHyper(hidden=(6,)))
+        learner = TD3(SPEC, LapHyper(hidden=(6,)))
         state, batch = random_state(learner, rng, "critic"), random_batch(rng, SPEC, 16)
         y = batch.reward * 2
         _, loss, fed = jax.jit(learner.fit_critic)(state, batch, y, batch.weight)
@@ -132,26 +139,26 @@ def with_outputs(network: Any, outputs: Any) -> Any:
     return (*hidden, last | {"bias": np.asarray(outputs, last["bias"].dtype)})
 
 
-@pytest.mark.parametrize("kind", [td3, sac])
+@pytest.mark.parametrize("kind", [TD3, SAC])
 def test_target_is_a_distribution(kind: Any, rng: np.random.Generator) -> None:
     """r + discount * each number of the lower twin, after a fall r alone, for SAC less entropy."""
-    learner = kind.build(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
+    learner = kind(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
     state = random_state(learner, rng, "actor")
     twins = with_outputs(state.target_critic, [DISTRIBUTION + 10, DISTRIBUTION])
     state = state._replace(target_critic=twins)
     batch = random_batch(rng, SPEC, 8)._replace(reward=np.full(8, 1.5))
     batch.discount[:2] = 0.99, 0
     y = np.asarray(jax.jit(learner.target)(state, batch, KEY))
-    assert y.shape == (8, 5)
-    entropy = y[0] - (1.5 + 0.99 * DISTRIBUTION)
+    assert y.shape == (5, 8)
+    entropy = y[:, 0] - (1.5 + 0.99 * DISTRIBUTION)
     np.testing.assert_allclose(entropy, entropy[0], rtol=1e-4, atol=1e-5)
-    assert (kind is sac) == bool(abs(entropy[0]) > 1e-3)
-    np.testing.assert_allclose(y[1], 1.5, rtol=1e-6)
+    assert (kind is SAC) == bool(abs(entropy[0]) > 1e-3)
+    np.testing.assert_allclose(y[:, 1], 1.5, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", [td3, sac])
+@pytest.mark.parametrize("kind", [TD3, SAC])
 def test_value_of_quantiles_is_their_mean(kind: Any, rng: np.random.Generator) -> None:
-    learner = kind.build(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
+    learner = kind(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
     state = random_state(learner, rng)
     critic = with_outputs(state.critic, [DISTRIBUTION, DISTRIBUTION - 1])
     batch = random_batch(rng, SPEC, 4)

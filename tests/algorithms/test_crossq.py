@@ -6,11 +6,20 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import KEY, close, member, perceptron, random_batch, random_state, slopes, squashed
+from numeric import (
+    KEY,
+    SPEC,
+    close,
+    member,
+    perceptron,
+    random_batch,
+    random_state,
+    slopes,
+    squashed,
+)
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.algorithms import crossq
-from pacesetter.batch import Spec
 from pacesetter.config import settle
 from pacesetter.networks import batch_renorm
 from pacesetter.policy import Policy, unstack
@@ -19,11 +28,10 @@ from pacesetter.training.trainer import Trainer
 train, fold, renormalize = (
     jax.jit(f) for f in (batch_renorm.train, batch_renorm.fold, batch_renorm.renormalize)
 )
-SPEC = Spec(observation_size=3, action_size=2)
 
 
 def learner(**hyper: Any) -> crossq.CrossQ:
-    return crossq.build(
+    return crossq.CrossQ(
         SPEC,
         crossq.Hyper(**{"hidden": (5, 4), "critic_hidden": (4, 3), "policy_delay": 1, **hyper}),
     )
@@ -164,7 +172,7 @@ def test_an_update_equals_a_reference_in_numpy(warm: bool, rng: np.random.Genera
         close(member(new.critic_opt_state[0].mu, i), halved(slopes(critic_loss, critic)))
         for layer, moved in zip(member(new.critic, i), forward.moved, strict=True):
             close({name: layer[name] for name in moved}, moved)
-    np.testing.assert_allclose(update.error[0], np.abs(said[:, :8] - y).max(axis=0))
+    np.testing.assert_allclose(update.td_error[0], np.abs(said[:, :8] - y).max(axis=0))
 
     forward = Pass(old.actor, batch.observation, warm)
 
@@ -207,7 +215,7 @@ def test_actor_moves_once_in_three(rng: np.random.Generator) -> None:
     assert not [name for name in state._fields if "target" in name]
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, 3, 8))
     update = jax.jit(algorithm.update)(state, batch, KEY)
-    assert update.error.shape == (3, 8)
+    assert update.td_error.shape == (3, 8)
     counts = [update.state.critic_opt_state, update.state.actor_opt_state]
     assert [int(adam[0].count) for adam in counts] == [3, 1]
     assert (int(update.state.alpha_opt_state[0].count), int(update.state.updates)) == (1, 3)
@@ -256,9 +264,9 @@ def test_policy_and_acting_are_plain_networks(rng: np.random.Generator) -> None:
     actors, box = algorithm.policy(state), np.ones(2, np.float32)
     policy = Policy(unstack(actors), actors.activation, actors.output, -box, box)
     np.testing.assert_allclose(policy(observation), np.tanh(mean), atol=1e-5)
-    acting = jax.device_get(jax.jit(algorithm.acting)(state))
+    params = jax.device_get(jax.jit(algorithm.policy_params)(state))
     noise = np.random.default_rng(1).standard_normal(2, np.float32)
-    action, _ = algorithm.act(acting, (), observation[0], np.random.default_rng(1))
+    action, _ = algorithm.act(params, (), observation[0], np.random.default_rng(1))
     wanted = np.tanh(mean[0] + np.exp(np.clip(log_std[0], -20, 2)) * noise)
     np.testing.assert_allclose(action, wanted, atol=1e-5)
 
@@ -269,6 +277,6 @@ def test_presets(name: str, width: int) -> None:
     hyper = settle(name, "Walker2d-v5").hyper
     assert (hyper.hidden, hyper.critic_hidden) == ((256, 256), (width, width))
     assert (hyper.policy_delay, hyper.adam_momentum, hyper.warmup) == (3, 0.5, 5000)
-    state = jax.eval_shape(crossq.build(SPEC, hyper).init, KEY)
+    state = jax.eval_shape(crossq.CrossQ(SPEC, hyper).init, KEY)
     shapes = [layer["kernel"].shape for layer in state.critic]
     assert shapes == [(2, 5, width), (2, width, width), (2, width, 1)]

@@ -8,17 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_kill
 from scipy.stats import chisquare
-from test_resume import stop_at
+from short_runs import assert_same, log, run_to_end
+from stopping import kill_and_resume, only_run, stop_at
 
-from conftest import assert_same, log, run_to_end
 from pacesetter import config
 from pacesetter.algorithms import me_trpo, trpo
-from pacesetter.batch import Batch, Spec
+from pacesetter.batch import Batch, Layout, Spec
 from pacesetter.cli.main import main
 from pacesetter.config import settle
-from pacesetter.dynamics.model import Known, Models
+from pacesetter.dynamics.model import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.networks import trust_region
 from pacesetter.replay import buffer
@@ -46,10 +45,16 @@ RUN: dict[str, Any] = {**SMALL, "eval_episodes": 1, "eval_every": 500, "checkpoi
 CART = Known(lambda s, a, after: after[..., 0], lambda after: after[..., 0] > 1)
 
 
-def learner(known: Known | None = CART, **settings: Any) -> me_trpo.METRPO:
+class Linear(me_trpo.METRPO):
     """A learner whose models have no hidden layer."""
-    built = me_trpo.build(Spec(1, 1), me_trpo.Hyper(**{**SMALL, **settings}), known)
-    return replace(built, dynamics=replace(built.dynamics, hidden=()))
+
+    @property
+    def dynamics(self) -> Dynamics:
+        return replace(super().dynamics, hidden=())
+
+
+def learner(known: Known | None = CART, **settings: Any) -> me_trpo.METRPO:
+    return Linear(Spec(1, 1), me_trpo.Hyper(**{**SMALL, **settings}), known)
 
 
 def linear(algorithm: me_trpo.METRPO, *drifts: float) -> Models:
@@ -182,6 +187,10 @@ def test_seventy_percent_of_the_models(worse: int, models: int, agreed: bool) ->
 class Scripted(me_trpo.METRPO):
     """The actor counts its updates; the models say of each count what a table holds."""
 
+    @property
+    def base(self) -> trpo.TRPO:
+        return Counting(self.spec, self.hyper)
+
     def imagine(self, models: Any, actor: Any, starts: Any, key: Any) -> Any:
         return None
 
@@ -198,9 +207,8 @@ class Counting(trpo.TRPO):
 def searched(table: Any, **settings: Any) -> me_trpo.Search:
     fixed = {"policy_updates": 50, "check_every": 5, "patience": 25, "initial_std": 1.0}
     hyper = me_trpo.Hyper(**{**SMALL, **fixed, **settings})
-    base = Counting(Spec(1, 1), hyper)
-    algorithm = Scripted(base, learner(models=5).dynamics, hyper)
-    start = base.init(jax.random.key(0))
+    algorithm = Scripted(Spec(1, 1), hyper)
+    start = algorithm.base.init(jax.random.key(0))
     none: Any = None
     return jax.jit(algorithm.search)(start, jnp.array(table, jnp.float32), none, jax.random.key(0))
 
@@ -237,9 +245,9 @@ def test_search_that_only_harms_gives_back_the_start() -> None:
 
 def test_ring_is_given_whole(tmp_path: Path) -> None:
     """Rows at their number modulo the size; what was not written is 0."""
-    ring = buffer.Replay(tmp_path / "ring.bin", buffer.Columns(1, 1), 10, 1_000)
+    ring = buffer.Replay(tmp_path / "ring.bin", Layout(Spec(1, 1)), 10, 1_000)
     for n in range(1, 26):
-        ring.append(np.full(ring.columns.width, n, np.float32))
+        ring.append(np.full(ring.layout.width, n, np.float32))
         window = ring.padded(10)[:, 0]
         expected = [
             max((m for m in range(n) if m % 10 == place), default=-1) for place in range(10)
@@ -302,19 +310,17 @@ def test_stopped_run_equals_uninterrupted(known: bool, runs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_run_equals_undisturbed(tmp_path: Path) -> None:
     words = ["train", "me-trpo", "Hopper-v5", "--steps", "8000", "--eval-episodes", "1", "-q"]
     words += ["--checkpoint-every", "0.1s", "--hidden", "8", "--model-hidden", "16"]
     for name in ("models", "rollout_length", "imagined_steps", "horizon", "policy_updates"):
         words += [f"--{name.replace('_', '-')}", str(SMALL[name])]
     words += ["--model-rows", "3000", "--model-batch-size", "64", "--replay-size", "3000"]
-    monkeypatch.setitem(test_kill.KILLED, "Hopper-v5", words)
     # A ring of the usual size: a whole rollout lies between two checkpoints.
-    plain = "import sys; from pacesetter.cli import main; sys.exit(main())"
-    monkeypatch.setattr(test_kill, "COMMAND", plain)
-    killed = test_kill.kill_and_resume("Hopper-v5", tmp_path, kills=2, seed=1)
+    usual = ("-m", "pacesetter")
+    killed = kill_and_resume(words, tmp_path, kills=2, seed=1, program=usual)
     assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
-    assert_same(test_kill.only_run(tmp_path / "whole"), killed)
+    assert_same(only_run(tmp_path / "whole"), killed)
 
 
 @pytest.mark.slow
@@ -402,7 +408,7 @@ def test_preset_builds_with_the_values_of_its_file() -> None:
     for key in table.keys() - {"algorithm", "help", "source", "env"}:
         value = table[key]
         assert getattr(hyper, key) == (tuple(value) if isinstance(value, list) else value), key
-    learner = me_trpo.build(Spec(17, 6), hyper)
+    learner = me_trpo.METRPO(Spec(17, 6), hyper)
     state = jax.eval_shape(learner.init, jax.random.key(0))
     assert state.learner.actor.network[0]["kernel"].shape == (17, 32)
     assert state.models.networks.change[0]["kernel"].shape == (5, 23, 1024)

@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.algorithms.sunrise import Sunrise
 from pacesetter.training.trainer import Trainer
 
@@ -100,7 +100,7 @@ def values(trainer: Trainer, observation: float, actions: Any = (-0.8, 0.0, 0.8)
 
 def members_values(algorithm: Sunrise) -> Any:
     """The values of all learners in an ensemble (N, critics, actions)."""
-    return jax.vmap(algorithm.base.learner.values, (0, None, None))
+    return jax.vmap(algorithm.base.values, (0, None, None))
 
 
 def near(found: Any, expected: Any) -> None:
@@ -223,8 +223,8 @@ def stored(env: str, runs: Path, steps: int, **settings: Any) -> Any:
     replay = ensemble.replays[0]
     run_to_end(trainer)
     path = replay.path
-    rows = np.fromfile(path, np.float32).reshape(-1, ensemble.columns.width)[:steps]
-    return jax.device_get(ensemble.columns.unpack(rows, None))
+    rows = np.fromfile(path, np.float32).reshape(-1, ensemble.layout.width)[:steps]
+    return jax.device_get(ensemble.layout.unpack(rows))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numeric import (
     KEY,
+    SPEC,
     close,
     member,
     perceptron,
@@ -19,20 +20,18 @@ from numeric import (
     slopes,
     squashed,
 )
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.algorithms import sac
-from pacesetter.batch import Spec
-from pacesetter.networks import mlp
+from pacesetter.networks import gaussian, mlp
 from pacesetter.policy import Policy, unstack
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
 NETWORKS = ("actor", "critic", "target_critic")
 
 
 def learner(**hyper: Any) -> sac.SAC:
-    return sac.build(SPEC, sac.Hyper(**{"hidden": (5, 4), **hyper}))
+    return sac.SAC(SPEC, sac.Hyper(**{"hidden": (5, 4), **hyper}))
 
 
 # The squashed Gaussian.
@@ -40,7 +39,7 @@ def learner(**hyper: Any) -> sac.SAC:
 
 def test_log_probability_is_the_golden_one() -> None:
     """mu 0, std 1, u .5: -.8037095, by three formulas."""
-    found = sac.log_probability(jnp.array([0.5]), jnp.array([0.5]), jnp.zeros(1))
+    found = gaussian.log_probability(jnp.array([0.5]), jnp.array([0.5]), jnp.zeros(1))
     assert float(found) == pytest.approx(-0.8037095, abs=1e-6)
     _, by_cosh = squashed(np.zeros(2), np.array([0.5]))
     assert float(by_cosh) == pytest.approx(-0.8037095, abs=1e-7)
@@ -54,14 +53,14 @@ def test_density_integrates_to_one() -> None:
     with jax.enable_x64(True):
         before, log_std = np.arctanh(action), np.log(0.7)
         noise = (before - 0.3) / 0.7
-        log_prob = sac.log_probability(before[:, None], noise[:, None], np.array([log_std]))
+        log_prob = gaussian.log_probability(before[:, None], noise[:, None], np.array([log_std]))
     assert float(np.trapezoid(np.exp(log_prob), action)) == pytest.approx(1, abs=1e-6)
 
 
 def test_log_probability_is_finite_where_tanh_saturates() -> None:
     """At u = +-50 the action is +-1 to the last bit, whose density the plain formula loses."""
     before = jnp.array([[50.0], [-50.0]])
-    found = sac.log_probability(before, jnp.zeros((2, 1)), jnp.zeros(1))
+    found = gaussian.log_probability(before, jnp.zeros((2, 1)), jnp.zeros(1))
     np.testing.assert_allclose(found, 100 - 2 * np.log(2) - 0.5 * np.log(2 * np.pi), rtol=1e-6)
 
 
@@ -70,9 +69,9 @@ def test_deviation_is_cut(said: float, used: float) -> None:
     """e^-20 at least and e^2 at most, in what learns and in what acts."""
     actor = ({"kernel": np.zeros((3, 2), np.float32), "bias": np.float32([0, said])},)
     expected = np.tanh(np.exp(used) * np.random.default_rng(0).standard_normal(1, np.float32))
-    acted = sac.explore(actor, np.zeros(3, np.float32), np.random.default_rng(0))
+    acted = gaussian.explore(actor, np.zeros(3, np.float32), np.random.default_rng(0))
     np.testing.assert_allclose(acted, expected, rtol=1e-6)
-    action, _ = sac.sample(actor, np.zeros((1, 3), np.float32), KEY)
+    action, _ = gaussian.sample(actor, np.zeros((1, 3), np.float32), KEY)
     noise = jax.random.normal(KEY, (1, 1))
     np.testing.assert_allclose(action, np.tanh(np.exp(used) * noise), rtol=1e-5)
 
@@ -151,14 +150,14 @@ def test_an_update_equals_a_reference_in_numpy(case: str, rng: np.random.Generat
         values = reference._say(critic, reference.batch.action).mean(axis=-1)
         errors.append(np.abs(values - y.mean(axis=-1)))
     assert update.losses["critic_loss"] == pytest.approx(sum(losses))
-    np.testing.assert_allclose(update.error[0], np.max(errors, axis=0))
+    np.testing.assert_allclose(update.td_error[0], np.max(errors, axis=0))
     moved = old._replace(critic=new.critic)
     actor_loss = partial(reference.actor_loss, moved)
     close(new.actor_opt_state[0].mu, scaled(slopes(actor_loss, old.actor), 0.1))
     assert update.losses["actor_loss"] == pytest.approx(actor_loss(old.actor))
     for part in ("actor", "critic"):  # the first Adam step is the rate in the gradient's direction
         rate = getattr(hyper, f"{part}_learning_rate")
-        moments = getattr(new, f"{part}_optimizer")[0].mu
+        moments = getattr(new, f"{part}_opt_state")[0].mu
         stepped = jax.tree.map(
             lambda x, m, r=rate: x - r * m / (np.abs(m) + 1e-9), getattr(old, part), moments
         )
@@ -225,9 +224,9 @@ def test_exploring_action_is_the_learners_own(rng: np.random.Generator) -> None:
     observation = rng.normal(size=3).astype(np.float32)
     mean, log_std = np.split(np.asarray(mlp.apply(state.actor, observation)), 2)
     ours, theirs = np.random.default_rng(5), np.random.default_rng(5)
-    memory = algorithm.start_episode(state.actor, ours)
+    noise_state = algorithm.start_episode(state.actor, ours)
     for _ in range(3):
-        action, memory = algorithm.act(state.actor, memory, observation, ours)
+        action, noise_state = algorithm.act(state.actor, noise_state, observation, ours)
         noise = theirs.standard_normal(2, np.float32)
         np.testing.assert_allclose(action, np.tanh(mean + np.exp(log_std) * noise), atol=1e-5)
 

@@ -1,7 +1,6 @@
 """STEVE: golden targets and weights, what it is without a model, and with a perfect one."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -9,72 +8,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from learners import NETWORKS, fresh, learner
+from numeric import KEY, SPEC, random_batch, same, single
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
-from pacesetter import algorithms
 from pacesetter.algorithms.steve import STEVE, combine
+from pacesetter.algorithms.steve_td3 import SteveTD3
 from pacesetter.algorithms.td3 import State
-from pacesetter.batch import Batch, Spec
+from pacesetter.batch import Batch
 from pacesetter.config import settle
-from pacesetter.dynamics.model import Dynamics, Known, Models
+from pacesetter.dynamics.model import Dynamics, Known
+from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.errors import UsageError
-from pacesetter.learner.compiled import inherit
 from pacesetter.policy import forward
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
-KEY = jax.random.key(3)
 SMALL: dict[str, Any] = {"hidden": (12, 10), "model_hidden": (8,), "head_hidden": (6,)}
-NETWORKS = ("actor", "critic", "target_actor", "target_critic")
-
-
-def learner(name: str, **hyper: Any) -> Any:
-    kind = algorithms.find(name)
-    return kind.build(SPEC, kind.Hyper(**hyper))
 
 
 def rows(*shape: int, seed: int = 0) -> Batch:
     """Random transitions, a fifth of them terminal, with uneven weights."""
-    rng = np.random.default_rng(seed)
-
-    def normal(*more: int) -> Any:
-        return rng.normal(size=(*shape, *more)).astype(np.float32)
-
-    return Batch(
-        observation=normal(3),
-        action=np.clip(normal(2), -1, 1),
-        reward=normal(),
-        next_observation=normal(3),
-        discount=rng.choice([0, 0.99], size=shape, p=[0.2, 0.8]).astype(np.float32),
-        last=np.zeros(shape, np.float32),
-        weight=rng.uniform(0.5, 1.5, size=shape).astype(np.float32),
-        mask=np.zeros((*shape, 0), np.float32),
-    )
+    return single(random_batch(np.random.default_rng(seed), SPEC, *shape))
 
 
 def compiled(method: Callable[..., Any]) -> Callable[..., Any]:
     inner = jax.jit(method)
     return lambda *arguments: jax.device_get(inner(*arguments))
-
-
-def new(algorithm: Any, seed: int = 3) -> Any:
-    """A state of random networks and moments that have not moved: `init` takes long to compile."""
-    rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(algorithm.init, KEY)
-    zero = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-
-    def draw(x: Any) -> Any:
-        return rng.normal(size=x.shape, scale=0.5).astype(x.dtype)
-
-    state = zero._replace(**{part: jax.tree.map(draw, getattr(zero, part)) for part in NETWORKS})
-    networks, scale = zero.models
-    scale = scale._replace(variance=scale.variance + 1)
-    return state._replace(models=Models(jax.tree.map(draw, networks), scale))
-
-
-def same(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 # Targets by hand.
@@ -93,8 +52,10 @@ class Script:
         return said((0, 0.2, 0.5), following)
 
 
-class ScriptedCritics:
-    """A base whose two pairs of twins say of a step what the script says, or more."""
+class Scripted(SteveTD3):
+    """Its two pairs of twins say of a step what the script says, or more."""
+
+    dynamics = cast(Any, Script())
 
     def next_action(self, state: Any, observation: Any, key: Any) -> Any:
         return jnp.zeros((len(observation), 2))
@@ -114,8 +75,8 @@ def said(script: tuple[float, ...], observation: Any) -> Any:
 
 
 def scripted(discount: float) -> list[Any]:
-    hyper = algorithms.find("steve-td3").Hyper(horizon=2, models=2, batch_size=4, **SMALL)
-    algorithm = STEVE(ScriptedCritics(), cast(Any, Script()), hyper)
+    hyper = SteveTD3.Hyper(horizon=2, models=2, batch_size=4, **SMALL)
+    algorithm = Scripted(SPEC, hyper)
     batch = rows(4)._replace(
         next_observation=np.zeros((4, 3), np.float32),
         reward=np.ones(4, np.float32),
@@ -155,9 +116,13 @@ def test_a_perfect_linear_model_gives_the_n_step_return() -> None:
     change = (0.3 * rng.normal(size=(5, 3))).astype(np.float32)
     known = Known(lambda s, a, t: s[..., 0] - a[..., 1] + 2 * t[..., 2], lambda t: t[..., 1] > 0.8)
     algorithm = learner("steve", gamma=gamma, horizon=horizon, batch_size=32, **SMALL)
-    dynamics = Dynamics(SPEC, members=4, hidden=(), known=known)
-    algorithm = replace(algorithm, dynamics=dynamics)
-    state = new(algorithm)
+    perfect = Dynamics(SPEC, members=4, hidden=(), known=known)
+
+    class Perfect(STEVE):
+        dynamics = perfect
+
+    algorithm = Perfect(algorithm.spec, algorithm.hyper)
+    state = fresh(algorithm, 3)
     layer = {"kernel": np.stack([change] * 4), "bias": np.zeros((4, 3), np.float32)}
     networks = state.models.networks._replace(change=(layer,))
     state = state._replace(models=state.models._replace(networks=networks))
@@ -195,14 +160,14 @@ def test_without_horizon_it_is_its_base(name: str, base: str) -> None:
     steve = learner(name, horizon=0, critic_members=1, batch_size=16, **SMALL)
     plain = learner(base, batch_size=16, hidden=SMALL["hidden"])  # acts otherwise, learns alike
     update, plain_update = compiled(steve.update), compiled(plain.update)
-    ours = new(steve)
+    ours = fresh(steve, 3)
     theirs = State(**{part: getattr(ours, part) for part in State._fields})
     for cycle in range(5):
         batch, key = rows(plain.updates_per_call, 16, seed=cycle), jax.random.key(cycle)
         mine, other = update(ours, batch, key), plain_update(theirs, batch, key)
         ours, theirs = mine.state, other.state
         assert_equal_networks(ours, theirs)
-        assert same(mine.error, other.error)
+        assert same(mine.td_error, other.td_error)
         assert mine.losses["model_use"] == 0
 
 
@@ -224,14 +189,15 @@ def test_a_whole_run_without_horizon_is_td3(runs: Path) -> None:
 def test_several_members_without_horizon_share_the_mean_target() -> None:
     """Each member is a pair of twins whose minimum counts; the actor climbs the first twins."""
     algorithm = learner("steve-td3", horizon=0, critic_members=3, batch_size=16, **SMALL)
-    assert algorithm.base.climbed == (0, 2, 4)
-    state, batch = new(algorithm), rows(16)
-    y, weight = compiled(algorithm.target)(state, batch, KEY)
-    action = compiled(algorithm.base.next_action)(state, batch.next_observation, KEY)
+    state, batch = fresh(algorithm, 3), rows(16)
+    y, weight = compiled(algorithm.expanded_target)(state, batch, KEY)
+    action = compiled(algorithm.next_action)(state, batch.next_observation, KEY)
     values = compiled(algorithm.values)(state.target_critic, batch.next_observation, action)
     expected = np.asarray(values).reshape(3, 2, 16).min(axis=1).mean(axis=0)
     np.testing.assert_allclose(y, batch.reward + batch.discount * expected, atol=1e-6)
     assert np.all(weight == 1)
+    climbed = compiled(algorithm.actor_value)(state.target_critic, batch.next_observation, action)
+    np.testing.assert_allclose(climbed, np.asarray(values)[::2].mean(axis=0), atol=1e-6)
 
 
 # Who learns from what.
@@ -240,7 +206,7 @@ def test_several_members_without_horizon_share_the_mean_target() -> None:
 @pytest.fixture(scope="module")
 def steve() -> tuple[Any, Any, Callable[..., Any]]:
     algorithm = learner("steve", horizon=2, critic_members=2, models=3, batch_size=16, **SMALL)
-    return algorithm, new(algorithm), compiled(algorithm.update)
+    return algorithm, fresh(algorithm, 3), compiled(algorithm.update)
 
 
 def test_each_model_and_critic_learns_from_rows_of_its_own(
@@ -258,7 +224,7 @@ def test_each_model_and_critic_learns_from_rows_of_its_own(
         assert same(*networks) != moved
     routes = np.asarray(algorithm.routes(16))
     np.testing.assert_array_equal(routes, [[1, 0] * 8, [0, 1] * 8])
-    fit_critic = compiled(algorithm.base.fit_critic)
+    fit_critic = compiled(algorithm.fit_critic)
     one, two = (
         fit_critic(state, batch, x.reward, batch.weight * routes)[0].critic for x in (batch, other)
     )
@@ -281,8 +247,10 @@ def test_model_use_is_what_horizon_0_does_not_get(steve: Any) -> None:
     fitted, _ = jax.device_get(
         jax.jit(algorithm.fit_models)(state, jax.tree.map(first, rows(1, 16)))
     )
-    (step_key,) = jax.random.split(KEY, 1)
-    _, weight = compiled(algorithm.target)(fitted, jax.tree.map(first, rows(1, 16)), step_key)
+    step_key, _ = jax.random.split(KEY)
+    _, weight = compiled(algorithm.expanded_target)(
+        fitted, jax.tree.map(first, rows(1, 16)), step_key
+    )
     np.testing.assert_allclose(weight.sum(axis=0), 1, rtol=1e-5)
     np.testing.assert_allclose(found.losses["model_use"], 1 - weight[0].mean(), rtol=1e-3)
     ledger = algorithm.ledger([], 10, 99)
@@ -300,7 +268,7 @@ def test_no_gradient_flows_through_the_target(steve: Any) -> None:
     def total(critic: Any, actor: Any, networks: Any) -> Any:
         models = state.models._replace(networks=networks)
         changed = state._replace(target_critic=critic, target_actor=actor, models=models)
-        return algorithm.target(changed, batch, KEY)[0].sum()
+        return algorithm.expanded_target(changed, batch, KEY)[0].sum()
 
     slope = jax.jit(jax.grad(total, (0, 1, 2)))
     gradient = slope(state.target_critic, state.target_actor, state.models.networks)
@@ -311,11 +279,11 @@ def test_no_gradient_flows_through_the_target(steve: Any) -> None:
 def test_copies_of_members(copy: str) -> None:
     """Models go with the networks; `weights` leaves each its own moments, `actor` its models."""
     algorithm = learner("steve", batch_size=16, **SMALL)
-    states = [new(algorithm, seed) for seed in (0, 1)]
+    states = [fresh(algorithm, seed) for seed in (0, 1)]
     states[1] = states[1]._replace(
         models_opt_state=jax.tree.map(lambda x: x + 1, states[1].models_opt_state)
     )
-    _, copied = inherit(states, np.array([0, 0]), copy)
+    _, copied = copy_from_parents(algorithm, states, np.array([0, 0]), copy)
     assert same(copied.actor, states[0].actor)
     assert same(copied.models, states[1 if copy == "actor" else 0].models)
     own = states[0 if copy == "full" else 1].models_opt_state
@@ -344,10 +312,10 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
 def test_sparse_exploration_is_the_published_one() -> None:
     """Each number, with probability .05 and alone, gets normal noise before the tanh."""
     algorithm = learner("steve", **SMALL)
-    acting = new(algorithm).actor
+    params = fresh(algorithm, 3).actor, ()
     rng, observation = np.random.default_rng(1), np.float32([0.1, -0.2, 0.3])
-    before = forward(acting, observation)
-    actions = np.array([algorithm.act(acting, (), observation, rng)[0] for _ in range(20_000)])
+    before = forward(params[0], observation)
+    actions = np.array([algorithm.act(params, (), observation, rng)[0] for _ in range(20_000)])
     noise = np.arctanh(actions) - before
     changed = np.abs(noise) > 1e-5
     assert np.all(np.abs(changed.mean(axis=0) - 0.05) < 5 * (0.05 * 0.95 / 20_000) ** 0.5)
@@ -361,7 +329,7 @@ def test_parameter_noise_adapts() -> None:
     algorithm = learner("steve-td3", batch_size=8, **noisy, **SMALL)
     state = jax.eval_shape(algorithm.init, KEY)
     found = jax.eval_shape(algorithm.update, state, rows(2, 8), KEY)
-    assert found.state.sigma.shape == found.losses["sigma"].shape == ()
+    assert found.state.exploration.shape == found.losses["sigma"].shape == ()
 
 
 def test_settings_that_cannot_work_are_refused() -> None:

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from learners import learner as any_learner
+from numeric import KEY, SPEC, double, member, random_batch, single
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
-from pacesetter import algorithms
 from pacesetter.algorithms import sunrise
 from pacesetter.batch import Batch, Spec
 from pacesetter.config import settle
@@ -20,11 +21,9 @@ from pacesetter.networks import mlp
 from pacesetter.policy import Policy, forward, load, unstack
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
-KEY = jax.random.key(3)
 BASES = {"sunrise": "sac", "sunrise-td3": "td3"}
 both = pytest.mark.parametrize("name", BASES)
-forms = pytest.mark.parametrize("reference", sunrise.FORMS)
+forms = pytest.mark.parametrize("reference", ["paper", "official"])
 pairs = pytest.mark.parametrize(
     ("name", "reference"),
     [
@@ -38,12 +37,11 @@ _jit = partial(jax.jit, static_argnums=0)
 init = _jit(lambda learner, key: learner.init(key))
 update = _jit(lambda learner, *arguments: learner.update(*arguments))
 target = _jit(lambda learner, *arguments: learner.target(*arguments))
-next_action = _jit(lambda learner, *arguments: learner.base.next_action(*arguments))
+next_action = _jit(lambda learner, *arguments: learner.next_action(*arguments))
 
 
 def learner(name: str, spec: Spec = SPEC, **hyper: Any) -> Any:
-    kind = algorithms.find(name)
-    return kind.build(spec, kind.Hyper(**{"hidden": (8,), **hyper}))
+    return any_learner(name, spec, **{"hidden": (8,), **hyper})
 
 
 def begin(algorithm: Any, key: Any = KEY) -> Any:
@@ -55,33 +53,9 @@ def begin(algorithm: Any, key: Any = KEY) -> Any:
 
 def minibatches(cycle: int, rows: int, mask: Any, seed: int = 0) -> Batch:
     """Random transitions (cycle, rows), all with the same masks (rows, N)."""
-    rng = np.random.default_rng(seed)
-    shape = (cycle, rows)
-
-    def normal(*more: int) -> Any:
-        return rng.normal(size=(*shape, *more)).astype(np.float32)
-
-    return Batch(
-        observation=normal(3),
-        action=np.clip(normal(2), -1, 1),
-        reward=normal(),
-        next_observation=normal(3),
-        discount=rng.choice([0, 0.99], size=shape, p=[0.2, 0.8]).astype(np.float32),
-        last=np.zeros(shape, np.float32),
-        weight=np.ones(shape, np.float32),
-        mask=np.broadcast_to(np.float32(mask), (cycle, rows, np.shape(mask)[-1])),
-    )
-
-
-def double(tree: Any) -> Any:
-    """Floats as float64."""
-    return jax.tree.map(
-        lambda x: x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x, tree
-    )
-
-
-def member(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)
+    batch = single(random_batch(np.random.default_rng(seed), SPEC, cycle, rows))
+    mask = np.broadcast_to(np.float32(mask), (cycle, rows, np.shape(mask)[-1]))
+    return batch._replace(weight=np.ones((cycle, rows), np.float32), mask=mask)
 
 
 def leaves(tree: Any) -> list[Any]:
@@ -107,7 +81,7 @@ def test_an_ensemble_of_one_is_its_base(name: str) -> None:
             state, alone = found.state, expected.state
             for one, other in zip(leaves(state), leaves(alone), strict=True):
                 np.testing.assert_allclose(one[0], other, rtol=1e-11, atol=1e-14)
-            np.testing.assert_allclose(found.error, expected.error, rtol=1e-11)
+            np.testing.assert_allclose(found.td_error, expected.td_error, rtol=1e-11)
             for loss, value in expected.losses.items():
                 np.testing.assert_allclose(found.losses[loss], value, rtol=1e-11)
     assert np.all(leaves(state.updates)[0] == 3 * base.updates_per_call)
@@ -137,7 +111,7 @@ def test_official_gradients_are_a_row_short(name: str) -> None:
         batch = jax.tree.map(lambda x: np.repeat(x, base.updates_per_call, axis=0), batch)
         found = update(ours, state, batch, KEY).state
         alone = update(base, member(state, 0), batch, KEY).state
-        moments = [field for field in found._fields if field.endswith("_optimizer")]
+        moments = [field for field in found._fields if field.endswith("_opt_state")]
         assert len(moments) == 3 if name == "sunrise" else 2
         for field in moments:
             pairs = zip(firsts(getattr(found, field)), firsts(getattr(alone, field)), strict=True)
@@ -163,7 +137,7 @@ def test_a_learner_without_rows_stands_still(name: str, reference: Any) -> None:
     batch = minibatches(ours.updates_per_call, 16, np.tile([1, 0, 1], (16, 1)))
     new = update(ours, state, batch, KEY).state
     assert all(np.isfinite(leaf).all() for leaf in leaves(new))
-    for field in (field for field in new._fields if field.endswith("_optimizer")):
+    for field in (field for field in new._fields if field.endswith("_opt_state")):
         for moment in firsts(getattr(new, field)):
             assert np.all(moment[1] == 0)
             assert np.any(moment[0] != 0)
@@ -198,8 +172,7 @@ def test_a_masked_mean_is_over_the_rows_that_count(reference: Any) -> None:
     """Weights (N, B) turn a mean over B into one over a learner's rows, or one row more."""
     ours = learner("sunrise", ensemble=3, reference=reference)
     mask = np.array([[1, 0, 0], [1, 1, 0], [1, 0, 0], [1, 1, 0]], np.float32)
-    surplus = sunrise.FORMS[reference].surplus
-    assert surplus == (reference == "official")
+    surplus = int(reference == "official")
     expected = [[4 / (4 + surplus)] * 4, [0, 4 / (2 + surplus), 0, 4 / (2 + surplus)], [0] * 4]
     np.testing.assert_allclose(ours.share(mask), expected, rtol=1e-6)
 
@@ -311,7 +284,7 @@ def test_no_gradient_flows_through_target_and_weight(reference: Any) -> None:
 def test_histogram_of_weights() -> None:
     """Shares by tenths, the last with its upper end; they sum to 1."""
     weight = jnp.array([0.5, 0.55, 0.61, 0.95, 1.0])
-    found = sunrise.report(jnp.full(5, 2.0), weight)
+    found = sunrise.backup_losses(jnp.full(5, 2.0), weight)
     shares = [float(found[f"backup_weight_0.{i}"]) for i in range(5, 10)]
     np.testing.assert_allclose(shares, [0.4, 0.2, 0, 0, 0.4], atol=1e-6)
     assert found["value_deviation"] == 2
@@ -336,11 +309,13 @@ def test_bound_that_is_chosen() -> None:
     actions = np.array([[0], [1]], np.float32)
     for weight, best in ((0, 0), (0.14002, 0), (0.14003, 1), (5, 1)):
         ours = learner("sunrise", Spec(1, 1), ensemble=2, reference="official", ucb=weight)
-        bounds = ours.bounds(critics, np.zeros(1, np.float32), actions)
+        bounds = ours.upper_bounds(critics, np.zeros(1, np.float32), actions)
         np.testing.assert_allclose(bounds, [1, 0.875 + weight * 0.892679], atol=1e-5)
         assert np.argmax(bounds) == best
     paper = learner("sunrise", Spec(1, 1), ensemble=2, ucb=2)  # the minimum of each pair
-    bounds = paper.bounds(straight_critics([[-1, 1], [-0.5, 3]]), np.zeros(1, np.float32), actions)
+    bounds = paper.upper_bounds(
+        straight_critics([[-1, 1], [-0.5, 3]]), np.zeros(1, np.float32), actions
+    )
     np.testing.assert_allclose(bounds, [1, 0.25 + 2 * 0.25], atol=1e-6)
 
 
@@ -366,8 +341,8 @@ def test_the_best_bound_by_loops(name: str, reference: Any, rng: np.random.Gener
     noise = {"exploration_noise": 0.4} if name == "sunrise-td3" else {}
     ours = learner(name, ensemble=size, reference=reference, ucb=2.0, **noise)
     state = begin(ours)
-    acting = jax.device_get(ours.policy_params(state))
-    memory = ours.start_episode(acting, rng)
+    params = jax.device_get(ours.policy_params(state))
+    noise_state = ours.start_episode(params, rng)
     winners = set()
     for step in range(30):
         observation = rng.normal(size=3).astype(np.float32)
@@ -384,7 +359,7 @@ def test_the_best_bound_by_loops(name: str, reference: Any, rng: np.random.Gener
             ]
             judged = np.min(pairs, axis=1) if reference == "paper" else np.ravel(pairs)
             bounds.append(np.mean(judged) + 2 * np.std(judged))
-        action, memory = ours.act(acting, memory, observation, draws)
+        action, noise_state = ours.act(params, noise_state, observation, draws)
         best = int(np.argmax(bounds))
         winners.add(best)
         assert action.shape == (2,)
@@ -398,20 +373,22 @@ def test_official_without_lambda_follows_one_learner(name: str, rng: np.random.G
     noise = {"exploration_noise": 0.4} if name == "sunrise-td3" else {}
     ours = learner(name, ensemble=3, reference="official", ucb=0, **noise)
     state = begin(ours)
-    acting = jax.device_get(ours.policy_params(state))
-    assert not acting.critic
+    params = jax.device_get(ours.policy_params(state))
+    assert not params.critic
     chosen = []
     for episode in range(300):
-        memory = ours.start_episode(acting, rng)
-        chosen.append(int(memory[1]))
+        noise_state = ours.start_episode(params, rng)
+        chosen.append(int(noise_state[1]))
         for step in range(2 if episode < 5 else 0):
             observation = rng.normal(size=3).astype(np.float32)
             mine = proposals(name, ours, state, observation, np.random.default_rng(step))
-            action, memory = ours.act(acting, memory, observation, np.random.default_rng(step))
+            action, noise_state = ours.act(
+                params, noise_state, observation, np.random.default_rng(step)
+            )
             np.testing.assert_allclose(action, mine[chosen[-1]], atol=1e-6)
-            assert int(memory[1]) == chosen[-1]
+            assert int(noise_state[1]) == chosen[-1]
     assert np.bincount(chosen).min() > 100 - 4 * (300 * 2 / 9) ** 0.5
-    assert learner(name, ucb=0).inference is sunrise.BEST_BOUND  # the paper's is greedy then
+    assert not learner(name, ucb=0).follows_one  # the paper's is greedy then
 
 
 @both
@@ -440,12 +417,12 @@ def test_ledger_and_log_of_a_run(name: str, runs: Path) -> None:
     """Ensemble updates, passes of the bounds, stored masks and the histogram."""
     settings = {**TINY, "hidden": (8,), "steps": 300, "ensemble": 3}
     trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
-    columns, path = trainer.ensemble.columns, trainer.ensemble.replays[0].path
+    layout, path = trainer.ensemble.layout, trainer.ensemble.replays[0].path
     last = run_to_end(trainer).rows()[-1]
     assert last["updates"] in (199, 200, 198)
     assert last["ensemble_updates"] == 3 * last["updates"]
     assert last["ucb_passes"] == 200 * (3 + 3 * 3 * 2)
-    rows = np.fromfile(path, np.float32).reshape(-1, columns.width)[:300]
+    rows = np.fromfile(path, np.float32).reshape(-1, layout.width)[:300]
     masks = rows[:, -3:]
     assert set(np.unique(masks)) == {0, 1}
     assert masks.sum(axis=1).min() == 1

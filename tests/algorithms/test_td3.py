@@ -8,8 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from learners import fresh, learner
+from numeric import KEY, SPEC, all_differ, member, random_batch, same, single
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter import algorithms
 from pacesetter.algorithms.td3 import TD3, State
 from pacesetter.batch import Batch, Spec
@@ -19,8 +21,6 @@ from pacesetter.networks import mlp
 from pacesetter.policy import Policy, load, to_env, unstack
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
-KEY = jax.random.key(3)
 ORIGINAL = {"action_layer": 1, "critic_decay": 1e-2, "output_bound": 3e-3}
 Nets = list[dict[str, Any]]
 Minibatches = Callable[..., Batch]
@@ -54,43 +54,8 @@ values = _compiled(TD3.values)
 asked = _compiled(_asked)
 
 
-def learner(name: str = "td3", spec: Spec = SPEC, **hyper: Any) -> TD3:
-    kind = algorithms.find(name)
-    return kind.build(spec, kind.Hyper(**{"hidden": (12, 10), **hyper}))
-
-
-def fresh(algorithm: TD3, seed: int = 0) -> State:
-    """A state with random networks, targets unlike them, and an optimiser that has not moved."""
-    rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(algorithm.init, KEY)
-    zero = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-
-    def draw(x: Any) -> Any:
-        return rng.normal(size=x.shape, scale=0.5).astype(x.dtype)
-
-    networks = ("actor", "critic", "target_actor", "target_critic")
-    return zero._replace(**{name: jax.tree.map(draw, getattr(zero, name)) for name in networks})
-
-
-def same(one: Any, other: Any) -> bool:
-    """All leaves equal bit for bit."""
-    assert jax.tree.structure(one) == jax.tree.structure(other)
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
-
-
-def all_differ(one: Any, other: Any) -> bool:
-    """Every leaf differs somewhere."""
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(not np.array_equal(a, b) for a, b in pairs)
-
-
 def constant(tree: Any, value: float) -> Any:
     return jax.tree.map(lambda x: np.full_like(x, value), tree)
-
-
-def member(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)
 
 
 def with_bias(network: Any, bias: Any) -> Any:
@@ -105,19 +70,7 @@ def minibatches(rng: np.random.Generator) -> Minibatches:
     """Batches of random transitions, some of them terminal, with uneven weights."""
 
     def make(*shape: int) -> Batch:
-        def normal(*more: int) -> Any:
-            return rng.normal(size=(*shape, *more)).astype(np.float32)
-
-        return Batch(
-            observation=normal(SPEC.observation_size),
-            action=np.clip(normal(SPEC.action_size), -1, 1),
-            reward=normal(),
-            next_observation=normal(SPEC.observation_size),
-            discount=rng.choice([0, 0.99], size=shape, p=[0.2, 0.8]).astype(np.float32),
-            last=np.zeros(shape, np.float32),
-            weight=rng.uniform(0.5, 1.5, size=shape).astype(np.float32),
-            mask=np.zeros((*shape, 0), np.float32),
-        )
+        return single(random_batch(rng, SPEC, *shape))
 
     return make
 
@@ -383,13 +336,14 @@ class Reference:
     """TD3 with hand-written derivatives, in float64; a critic is a list of layers."""
 
     def __init__(self, algorithm: TD3, state: State) -> None:
-        self.hyper, self.joins = algorithm.hyper, algorithm.action_layer
+        self.hyper = algorithm.hyper
+        self.joins = getattr(self.hyper, "action_layer", 0)
         self.actor, self.target_actor = plain(state.actor), plain(state.target_actor)
         count = algorithm.hyper.critics
         self.critics = [plain(member(state.critic, i)) for i in range(count)]
         self.targets = [plain(member(state.target_critic, i)) for i in range(count)]
         self.actor_adam = Adam(self.actor, self.hyper.actor_learning_rate)
-        rate, decay = self.hyper.critic_learning_rate, algorithm.critic_decay
+        rate, decay = self.hyper.critic_learning_rate, getattr(self.hyper, "critic_decay", 0.0)
         self.critic_adams = [Adam(critic, rate, decay) for critic in self.critics]
 
     def update(self, batch: Batch, noise: list[Any]) -> None:
@@ -442,7 +396,7 @@ def plain(network: Any) -> Nets:
 
 def smoothing_noise(algorithm: TD3, batch: Batch, key: Any) -> list[Any]:
     """The unclipped noise that `update` draws with this key."""
-    keys = jax.random.split(key, algorithm.updates_per_call)
+    *keys, _ = jax.random.split(key, algorithm.updates_per_call + 1)
     draws = [jax.random.normal(k, batch.action.shape[1:], batch.action.dtype) for k in keys]
     return [algorithm.hyper.target_noise * np.asarray(draw, np.float64) for draw in draws]
 
@@ -541,11 +495,11 @@ def noise_of(kind: str, scale: float, steps: int, size: int) -> Any:
     """A long episode's actions (steps, size) of an actor whose clean action is 0."""
     algorithm = learner(spec=Spec(3, size), exploration=kind, exploration_noise=scale)
     rng, observation = np.random.default_rng(1), np.zeros(3, np.float32)
-    acting = constant(fresh(algorithm).actor, 0)
-    memory = algorithm.start_episode(acting, rng)
+    params = constant(fresh(algorithm).actor, 0), ()
+    noise_state = algorithm.start_episode(params, rng)
     actions: list[Any] = []
     for _ in range(steps):
-        action, memory = algorithm.act(acting, memory, observation, rng)
+        action, noise_state = algorithm.act(params, noise_state, observation, rng)
         actions.append(action)
     return np.array(actions)
 
@@ -645,9 +599,9 @@ def test_policy_file_acts_as_the_learner(
     np.testing.assert_allclose(loaded.act(observations), expected, rtol=0, atol=1e-6)
     in_env = low + (high - low) * (expected + 1) / 2
     np.testing.assert_allclose(loaded(observations), in_env, rtol=0, atol=5e-6)
-    acting = jax.device_get(algorithm.policy_params(state))
+    params = jax.device_get(algorithm.policy_params(state))
     for x, action in zip(scaled, expected, strict=True):
-        found, _ = algorithm.act(acting, (), x, rng)
+        found, _ = algorithm.act(params, (), x, rng)
         np.testing.assert_allclose(found, action, rtol=0, atol=1e-6)
 
 

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_kill
 from broken_envs import Late
 from jax.flatten_util import ravel_pytree
 from scipy.stats import norm
-from test_resume import stop_at
+from short_runs import assert_same, log, run_to_end
+from stopping import kill_and_resume, only_run, stop_at
 
-from conftest import assert_same, log, run_to_end
 from pacesetter import storage
 from pacesetter.algorithms import trpo
 from pacesetter.algorithms.contract import Update
@@ -96,8 +95,8 @@ def test_fisher_product_equals_hessian_of_kl(rng: np.random.Generator) -> None:
     parameters += 0.3 * rng.normal(size=len(parameters)).astype(np.float32)
     observation = jnp.array(rng.normal(size=(50, 3)), jnp.float32)
 
-    def distribution(parameters: Any) -> trust_region.Moments:
-        return trust_region.moments(unravel(parameters), observation)
+    def distribution(parameters: Any) -> trust_region.Distribution:
+        return trust_region.distribution_of(unravel(parameters), observation)
 
     @jax.jit
     def both(parameters: Any) -> Any:
@@ -137,8 +136,8 @@ def test_step_is_along_the_natural_gradient(rng: np.random.Generator) -> None:
         parameters, unravel = ravel_pytree(actor)
         assert len(parameters) == 22
 
-        def distribution(parameters: Any) -> trust_region.Moments:
-            return trust_region.moments(unravel(parameters), observation)
+        def distribution(parameters: Any) -> trust_region.Distribution:
+            return trust_region.distribution_of(unravel(parameters), observation)
 
         def surrogate(parameters: Any) -> Any:  # its gradient where the ratio is 1
             return (
@@ -177,7 +176,7 @@ def test_updates_stay_in_the_trust_region(updated: Any) -> None:
     """KL and gain, computed anew from the actors before and after, are as reported and allowed."""
     for state, batch, update in updated:
         old, new = (
-            trust_region.moments(actor, batch.observation.reshape(-1, 3))
+            trust_region.distribution_of(actor, batch.observation.reshape(-1, 3))
             for actor in (state.actor, update.state.actor)
         )
         divergence = float(trust_region.kl(old, new))
@@ -187,8 +186,8 @@ def test_updates_stay_in_the_trust_region(updated: Any) -> None:
         assert update.losses["surrogate"] > 0
     first, last = updated[0][0].actor, updated[-1][2].state.actor
     observation = jnp.zeros((1, 3))
-    rise = trust_region.moments(last, observation)[0] - trust_region.moments(first, observation)[0]
-    assert (rise > 0.3).all()  # larger actions pay more
+    before, after = (trust_region.distribution_of(each, observation)[0] for each in (first, last))
+    assert (after - before > 0.3).all()  # larger actions pay more
 
 
 def test_no_gradient_is_no_step() -> None:
@@ -230,7 +229,8 @@ def test_line_search_takes_no_nan() -> None:
 
 def advantages_by_loop(batch: Batch, values: Any, following: Any, decay: float) -> Any:
     """The sum of the definition, term by term."""
-    reward, discount, last = (np.asarray(x, float) for x in (batch[2], batch[4], batch[5]))
+    parts = batch.reward, batch.discount, batch.last
+    reward, discount, last = (np.asarray(part, float) for part in parts)
     found = np.zeros(reward.shape)
     steps, envs = reward.shape
     for e in range(envs):
@@ -271,7 +271,7 @@ def test_advantages_at_ends(discounts: Any, lasts: Any, expected: Any) -> None:
         return jnp.array(numbers, jnp.float32)[:, None]
 
     none: Any = None
-    batch = Batch(none, none, jnp.ones((3, 1)), none, column(discounts), column(lasts), none, none)
+    batch = Batch(none, none, jnp.ones((3, 1)), none, column(discounts), column(lasts), none)
     found = trpo.advantages(batch, jnp.zeros((3, 1)), jnp.full((3, 1), 10.0), 1.0)
     np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6)
 
@@ -282,11 +282,11 @@ def test_advantages_at_ends(discounts: Any, lasts: Any, expected: Any) -> None:
 def test_sums_equal_those_of_all_values(rng: np.random.Generator) -> None:
     parts = [rng.normal(100, 3, size=50).astype(np.float32) for _ in range(6)]
     sums = jnp.zeros(3)
-    assert trpo.deviation(sums) == 1
+    assert trpo.standard_deviation(sums) == 1
     for part in parts:
-        sums = trpo.add_moments(sums, jnp.array(part))
+        sums = trpo.add_statistics(sums, jnp.array(part))
     together = np.concatenate(parts)
-    np.testing.assert_allclose(trpo.deviation(sums), together.std(), rtol=1e-4)
+    np.testing.assert_allclose(trpo.standard_deviation(sums), together.std(), rtol=1e-4)
     np.testing.assert_allclose(sums[:2], [300, together.mean()], rtol=1e-5)
 
 
@@ -404,7 +404,7 @@ def test_rollout_follows_each_env_in_time(runs: Path, monkeypatch: pytest.Monkey
     seen = watch(trainer, monkeypatch)
     run_to_end(trainer)
     rows = np.concatenate([rows for _, rows, _ in seen])
-    batch = trainer.ensemble.columns.unpack(jnp.array(rows), None)
+    batch = trainer.ensemble.layout.unpack(jnp.array(rows))
     np.testing.assert_array_equal(batch.observation[..., 0], np.arange(8)[:, None] % 3 * [1, 1, 1])
     np.testing.assert_array_equal(batch.next_observation[..., 0], batch.observation[..., 0] + 1)
     np.testing.assert_array_equal(batch.last, batch.next_observation[..., 0] == 3)
@@ -418,7 +418,7 @@ def test_actions_are_stored_uncut_and_done_cut(runs: Path, monkeypatch: pytest.M
     trainer = Trainer("trpo", "probe_envs:Echo-v0", runs=runs, env_kwargs=kwargs, **settings)
     ((_, rows, _),) = (seen := watch(trainer, monkeypatch), run_to_end(trainer))[0]
     assert len(seen) == 1
-    batch = trainer.ensemble.columns.unpack(jnp.array(rows), None)
+    batch = trainer.ensemble.layout.unpack(jnp.array(rows))
     np.testing.assert_allclose(batch.action.std(), 2, atol=0.15)
     np.testing.assert_allclose(batch.next_observation, jnp.clip(batch.action, -1, 1), atol=1e-6)
 
@@ -435,14 +435,14 @@ def test_statistics_stay_during_an_iteration(runs: Path, monkeypatch: pytest.Mon
         stream.bit_generator.state = rng.bit_generator.state
     fresh.close()
     gathered: list[Any] = []
-    for acting, rows, (mean, deviation) in seen:
+    for params, rows, (mean, deviation) in seen:
         if gathered:
             together = np.concatenate(gathered)
             np.testing.assert_allclose(mean, together.mean(axis=0), rtol=1e-4, atol=1e-5)
             np.testing.assert_allclose(deviation, together.std(axis=0), rtol=1e-3, atol=1e-3)
-        batch = trainer.ensemble.columns.unpack(jnp.array(rows), None)
+        batch = trainer.ensemble.layout.unpack(jnp.array(rows))
         scaled = jnp.clip((batch.observation - mean) / deviation, -10, 10)
-        middle, log_std = trust_region.moments(trust_region.Gaussian(*acting), scaled)
+        middle, log_std = trust_region.distribution_of(trust_region.Gaussian(*params), scaled)
         noise = (batch.action - middle) / np.exp(log_std)
         drawn = np.stack([rng.standard_normal((20, 3), np.float32) for rng in streams], axis=1)
         np.testing.assert_allclose(noise, drawn, atol=1e-4)
@@ -470,7 +470,7 @@ def test_stopped_run_equals_uninterrupted(normalize: bool, runs: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_run_equals_undisturbed(tmp_path: Path) -> None:
     words = [
         "train",
         "trpo",
@@ -484,10 +484,9 @@ def test_killed_run_equals_undisturbed(tmp_path: Path, monkeypatch: pytest.Monke
     ]
     words += ["--rollout-length", "50", "--eval-every", "5000", "--eval-episodes", "1", "-q"]
     words += ["--checkpoint-every", "0.2s"]
-    monkeypatch.setitem(test_kill.KILLED, "Hopper-v5", words)
-    killed = test_kill.kill_and_resume("Hopper-v5", tmp_path, kills=3, seed=1)
+    killed = kill_and_resume(words, tmp_path, kills=3, seed=1)
     assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
-    assert_same(test_kill.only_run(tmp_path / "whole"), killed)
+    assert_same(only_run(tmp_path / "whole"), killed)
 
 
 def test_fault_of_an_env_is_named(runs: Path) -> None:

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
+from short_runs import TINY, assert_same, run_to_end
 
-from conftest import TINY, assert_same, run_to_end
 from pacesetter import storage
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError

@@ -14,8 +14,8 @@ from typing import Any
 import demo
 import jax
 import pytest
+from short_runs import TINY, assert_same, run_to_end
 
-from conftest import TINY, assert_same, run_to_end
 from pacesetter import algorithms, config
 from pacesetter.algorithms import ddpg
 from pacesetter.batch import Spec

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numeric import SPEC, member, same
 
-from pacesetter.batch import Batch, Spec
+from pacesetter.batch import Batch
 from pacesetter.dynamics import fit as fitting
 from pacesetter.dynamics.model import (
     DETERMINISTIC,
@@ -21,20 +22,10 @@ from pacesetter.dynamics.model import (
     quantities,
 )
 
-SPEC = Spec(observation_size=3, action_size=2)
 KEY = jax.random.key(5)
 SMALL = Dynamics(SPEC, members=3, hidden=(24, 24), head_hidden=(12,), learning_rate=3e-3)
 CHANGE = np.random.default_rng(1).normal(size=(5, 3)).astype(np.float32)
 fit = jax.jit(fitting.fit, static_argnames=("dynamics", "batch_size"))
-
-
-def same(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
-
-
-def member(tree: Any, index: int) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)
 
 
 def rows(*shape: int, seed: int = 0, noise: Any = None) -> Batch:

@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from test_ensemble import IDLE, start
-from test_td3 import same
+from numeric import same
+from scripted_runs import IDLE, start
+from short_runs import log, run_to_end
 
-from conftest import log, run_to_end
 from pacesetter.ensemble.policy_checkpoint import Assessment
 from pacesetter.policy import load
 from pacesetter.training.trainer import Trainer

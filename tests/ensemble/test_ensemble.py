@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_td3 import SPEC, all_differ, fresh, learner, same
+from learners import SPEC, fresh, learner
+from numeric import all_differ, same
+from scripted_runs import ENV, IDLE, script, start
+from short_runs import assert_same, content, log, run_to_end
 
-from conftest import TINY, assert_same, content, log, run_to_end
 from pacesetter import envs
 from pacesetter.algorithms.contract import NO_MASK, Update
 from pacesetter.ensemble.selection import REMEMBERED, measure
@@ -27,29 +29,7 @@ from pacesetter.replay.buffer import Columns
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.training.trainer import Report, Trainer
 
-ENV = "probe_envs:Scripted-v0"
-IDLE = {"updates_per_step": 1e-9}  # nobody learns, where only counting matters
 NETWORKS = ("actor", "critic", "target_actor", "target_critic")
-
-
-def start(
-    runs: Path,
-    returns: Any = ([3], [5], [4]),
-    lengths: tuple[int, ...] = (10, 10, 10),
-    algorithm: str = "multi-td3",
-    **settings: Any,
-) -> Trainer:
-    """A run whose member k plays episodes of given length and returns, marked k."""
-    trainer = Trainer(algorithm, ENV, runs=runs, **{**TINY, "warmup": 0, "steps": 120, **settings})
-    for k, env in enumerate(trainer.ensemble.envs):
-        script(env, returns=list(returns[k]), length=lengths[k], mark=float(k), episode=-1)
-    return trainer
-
-
-def script(env: Any, **attributes: Any) -> None:
-    for name, value in attributes.items():
-        assert hasattr(env.env.unwrapped, name)
-        setattr(env.env.unwrapped, name, value)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import numpy as np
 from pacesetter.batch import Batch, Spec
 
 KEY = jax.random.key(3)
+SPEC = Spec(observation_size=3, action_size=2)
 
 
 def random_batch(rng: np.random.Generator, spec: Spec, *shape: int) -> Batch:
@@ -32,7 +33,7 @@ def random_batch(rng: np.random.Generator, spec: Spec, *shape: int) -> Batch:
 def random_state(algorithm: Any, rng: np.random.Generator, *networks: str) -> Any:
     """A new state in float64 whose networks are random, so that targets are unlike them."""
     state = jax.device_get(jax.jit(algorithm.init)(KEY))
-    state = jax.tree.map(lambda x: x.astype(float) if x.dtype.kind == "f" else x, state)
+    state = double(state)
 
     def draw(path: Any, x: Any) -> Any:
         noise = rng.normal(size=x.shape, scale=0.5)
@@ -40,6 +41,33 @@ def random_state(algorithm: Any, rng: np.random.Generator, *networks: str) -> An
 
     drawn = {n: jax.tree_util.tree_map_with_path(draw, getattr(state, n)) for n in networks}
     return state._replace(**drawn)
+
+
+def single(tree: Any) -> Any:
+    """All numbers with a fraction as float32, which training uses."""
+    return _cast(tree, np.float32)
+
+
+def double(tree: Any) -> Any:
+    """The same as float64."""
+    return _cast(tree, np.float64)
+
+
+def _cast(tree: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda x: x.astype(dtype) if x.dtype.kind == "f" else x, tree)
+
+
+def same(one: Any, other: Any) -> bool:
+    """All leaves equal bit for bit."""
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+
+
+def all_differ(one: Any, other: Any) -> bool:
+    """Every leaf differs somewhere."""
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(not np.array_equal(a, b) for a, b in pairs)
 
 
 def member(tree: Any, index: int) -> Any:

@@ -10,7 +10,7 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import NO_MASK, Array, Update
+from pacesetter.algorithms.contract import Array, Learner, Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.policy import Actors, forward
@@ -38,16 +38,12 @@ class State(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plain:
+class Plain(Learner):
     """The learner of one member."""
 
     Hyper: ClassVar[type] = Hyper
     spec: Spec
     hyper: Hyper
-    cycle: int = 1
-
-    def mask(self, rng: np.random.Generator) -> Floats:
-        return NO_MASK
 
     def init(self, key: Array) -> State:
         (observation, action), hidden = self.spec, (self.hyper.width,)
@@ -57,18 +53,15 @@ class Plain:
         moments = self._adam.init(actor), self._adam.init(critic)
         return State(actor, critic, *moments, jnp.zeros((), jnp.int32))
 
-    def acting(self, state: State) -> mlp.Network:
+    def policy_params(self, state: State) -> mlp.Network:
         return state.actor
 
-    def begin(self, acting: Any, rng: np.random.Generator) -> tuple[()]:
-        return ()
-
     def act(
-        self, acting: Any, memory: Any, observation: Floats, rng: np.random.Generator
+        self, params: Any, noise_state: Any, observation: Floats, rng: np.random.Generator
     ) -> tuple[Floats, Any]:
-        action = np.tanh(forward(acting, observation))
+        action = np.tanh(forward(params, observation))
         noise = rng.standard_normal(action.shape, np.float32)
-        return action + np.float32(self.hyper.noise) * noise, memory
+        return action + np.float32(self.hyper.noise) * noise, noise_state
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         rows = jax.tree.map(lambda x: x[0], batch)

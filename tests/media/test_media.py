@@ -12,8 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from policies import untrained
 
-from pacesetter.envs import Environment, make
+from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
 from pacesetter.media.curve import curve
 from pacesetter.media.record import INSTALL, record
@@ -21,21 +22,6 @@ from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 
 TOLD = ("MUJOCO_GL", "IMAGEIO_FFMPEG_NO_PREVENT_SIGINT")
-
-
-def untrained(env: str, **about: Any) -> Policy:
-    """One linear layer of the right size."""
-    world = make(env)
-    box: Any = world.action_space
-    observations, actions = world.observation_space.shape, box.shape
-    low, high = box.low.astype(np.float32), box.high.astype(np.float32)
-    world.close()
-    assert observations is not None
-    assert actions is not None
-    weights = np.random.default_rng(3).normal(0, 0.3, (observations[0], actions[0]))
-    kernel, bias = weights.astype(np.float32), np.zeros(actions, np.float32)
-    layers = [{"kernel": kernel, "bias": bias}]
-    return Policy([layers], "relu", "tanh", low, high, about={"env": env, **about})
 
 
 @pytest.fixture

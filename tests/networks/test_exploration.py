@@ -8,38 +8,29 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import KEY, perceptron, random_batch, random_state
+from learners import NETWORKS
+from learners import learner as any_learner
+from numeric import KEY, SPEC, perceptron, random_batch, random_state, same, single
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
-from pacesetter import algorithms
 from pacesetter.algorithms import td3
-from pacesetter.batch import Spec
+from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.errors import UsageError
-from pacesetter.learner.compiled import inherit
 from pacesetter.networks import exploration, mlp
 from pacesetter.policy import unstack
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
-NETWORKS = ("actor", "critic", "target_actor", "target_critic")
 NOISY = {"exploration": "parameter", "actor_layer_norm": True}
 adapt = jax.jit(exploration.adapt_sigma, static_argnums=2)
 perturb, act = jax.jit(exploration.perturb), jax.jit(mlp.actor)
 
 
 def learner(name: str = "td3", **hyper: Any) -> td3.TD3:
-    kind = algorithms.find(name)
-    return kind.build(SPEC, kind.Hyper(**{"hidden": (8, 6), **NOISY, **hyper}))
+    return any_learner(name, **{"hidden": (8, 6), **NOISY, **hyper})
 
 
 def new_state(algorithm: td3.TD3, rng: np.random.Generator) -> Any:
-    state = random_state(algorithm, rng, *NETWORKS)
-    return jax.tree.map(lambda x: x.astype(np.float32) if x.dtype.kind == "f" else x, state)
-
-
-def same(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+    return single(random_state(algorithm, rng, *NETWORKS))
 
 
 # Sigma.
@@ -127,15 +118,15 @@ def test_sigma_adapts_every_50_updates(delay: int, rng: np.random.Generator) -> 
     state, moved = jax.jit(algorithm.init)(KEY), []
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, delay, 4))
     update = jax.jit(algorithm.update)
-    assert float(state.sigma) == np.float32(0.1)
+    assert float(state.exploration) == np.float32(0.1)
     for i in range(160 // delay):
         result = update(state, batch, jax.random.key(i))
-        ratio = float(result.state.sigma) / float(state.sigma)
+        ratio = float(result.state.exploration) / float(state.exploration)
         if ratio != 1:
             assert ratio == pytest.approx(1.01 if ratio > 1 else 1 / 1.01, rel=1e-6)
             moved.append(int(result.state.updates))
         state = result.state
-        assert result.losses["sigma"] == state.sigma
+        assert result.losses["sigma"] == state.exploration
     assert moved == [-(-n // delay) * delay for n in (50, 100, 150)]
 
 
@@ -146,11 +137,11 @@ def test_learning_knows_only_the_clean_policy(name: str, rng: np.random.Generato
     state = new_state(algorithm, rng)
     batch = jax.tree.map(np.float32, random_batch(rng, SPEC, algorithm.updates_per_call, 16))
     update = jax.jit(algorithm.update)
-    found = [update(state._replace(sigma=np.float32(s)), batch, KEY) for s in (1e-3, 0.9)]
-    reference = jax.jit(plain.update)(state._replace(sigma=None), batch, KEY)
+    found = [update(state._replace(exploration=np.float32(s)), batch, KEY) for s in (1e-3, 0.9)]
+    reference = jax.jit(plain.update)(state._replace(exploration=()), batch, KEY)
     for one in found:
-        assert same(one.state._replace(sigma=None), reference.state)
-        assert same(one.error, reference.error)
+        assert same(one.state._replace(exploration=()), reference.state)
+        assert same(one.td_error, reference.td_error)
         assert same({k: v for k, v in one.losses.items() if k != "sigma"}, reference.losses)
 
 
@@ -165,16 +156,16 @@ def test_policy_is_clean(rng: np.random.Generator) -> None:
 def test_an_episode_is_acted_by_one_noisy_actor(rng: np.random.Generator) -> None:
     """Its actions are the noisy actor's own, it does not change, and nothing else is drawn."""
     algorithm = learner()
-    acting = jax.device_get(algorithm.policy_params(new_state(algorithm, rng)))
-    first = memory = algorithm.start_episode(acting, rng)
+    params = jax.device_get(algorithm.policy_params(new_state(algorithm, rng)))
+    first = noise_state = algorithm.start_episode(params, rng)
     drawn = rng.bit_generator.state
     for _ in range(3):
         observation = np.ones(3, np.float32)
-        action, memory = algorithm.act(acting, memory, observation, rng)
+        action, noise_state = algorithm.act(params, noise_state, observation, rng)
         np.testing.assert_allclose(action, np.tanh(perceptron(first, observation)), atol=1e-5)
-        assert memory is first
+        assert noise_state is first
     assert rng.bit_generator.state == drawn
-    assert not same(first, algorithm.start_episode(acting, rng))
+    assert not same(first, algorithm.start_episode(params, rng))
 
 
 def test_noisy_actor_lasts_an_episode(runs: Path) -> None:
@@ -199,9 +190,9 @@ def test_noisy_actor_lasts_an_episode(runs: Path) -> None:
 def test_sigma_is_copied_with_its_actor(mode: str, rng: np.random.Generator) -> None:
     """Whatever else a copy takes along, the parent's sigma fits the parent's actor."""
     algorithm = learner()
-    states = [new_state(algorithm, rng)._replace(sigma=np.float32(s)) for s in (0.2, 0.7)]
-    copied = inherit(states, np.array([1, 1]), mode)
-    assert [float(state.sigma) for state in copied] == [np.float32(0.7)] * 2
+    states = [new_state(algorithm, rng)._replace(exploration=np.float32(s)) for s in (0.2, 0.7)]
+    copied = copy_from_parents(algorithm, states, np.array([1, 1]), mode)
+    assert [float(state.exploration) for state in copied] == [np.float32(0.7)] * 2
     assert same(copied[0].actor, states[1].actor)
 
 
@@ -209,8 +200,8 @@ def test_sigma_is_copied_with_its_actor(mode: str, rng: np.random.Generator) -> 
 def test_without_parameter_noise_there_is_no_sigma(mode: str, rng: np.random.Generator) -> None:
     algorithm = learner(exploration="gaussian")
     states = [new_state(algorithm, rng) for _ in range(2)]
-    assert states[0].sigma is None
-    assert [state.sigma for state in inherit(states, np.array([1, 1]), mode)] == [None, None]
+    copied = copy_from_parents(algorithm, states, np.array([1, 1]), mode)
+    assert [state.exploration for state in (*states, *copied)] == [()] * 4
 
 
 @pytest.mark.parametrize("name", ["td3", "ddpg"])

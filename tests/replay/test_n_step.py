@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.replay.n_step import Pending, Transition
 from pacesetter.training.trainer import Trainer
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from short_runs import TINY, content, run_to_end
 
-from conftest import TINY, content, run_to_end
 from pacesetter.replay.buffer import Columns, Replay
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.priorities import choose

@@ -16,8 +16,8 @@ from typing import Any
 import broken_envs
 import numpy as np
 import pytest
+from short_runs import assert_same
 
-from conftest import assert_same
 from pacesetter import algorithms
 from pacesetter.cli import bench_progress
 from pacesetter.cli.flags import add_settings, parser, split_env_kwargs

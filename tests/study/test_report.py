@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from compare import make_run
-from test_media import untrained
+from policies import untrained
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError

@@ -13,8 +13,8 @@ from typing import Any
 
 import broken_envs
 import pytest
+from short_runs import TINY
 
-from conftest import TINY
 from pacesetter import algorithms
 from pacesetter.cli.main import main
 from pacesetter.config import settle

@@ -1,10 +1,7 @@
 """Runs that are killed, asked to stop, or fail by a NaN lose nothing that a checkpoint holds."""
 
-import os
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -16,8 +13,20 @@ import jax
 import numpy as np
 import pytest
 from broken_envs import Late
+from short_runs import TINY, assert_same, run_to_end
+from stopping import (
+    PATIENCE,
+    RING,
+    has_saved_beyond,
+    kill_and_resume,
+    launch,
+    litter,
+    only_run,
+    saved_step,
+    training,
+    wait_for,
+)
 
-from conftest import TINY, assert_same, run_to_end
 from pacesetter import storage
 from pacesetter.cli.main import main
 from pacesetter.errors import TrainingError
@@ -25,22 +34,12 @@ from pacesetter.replay import buffer
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.training.trainer import Trainer
 
-# The ring in small, so that it goes round several times within one short run.
-RING = {"BLOCK": 64, "UNCOMMITTED": 150, "SLACK": 364}
-COMMAND = f"""
-import sys
-from pacesetter.training import replay
-vars(replay).update({RING})
-from pacesetter.cli import main
-sys.exit(main())
-"""
 FLAGS = ["--hidden", "16", "16", "--batch-size", "16", "--warmup", "200", "--replay-size", "300"]
 FLAGS += ["--eval-episodes", "1", "--eval-every", "1000", "--checkpoint-every", "0.3s", "-q"]
 KILLED = {
     "HalfCheetah-v5": ["train", "td3", "HalfCheetah-v5", "--steps", "3000", *FLAGS],
     "Ant-v5": ["train", "multi-td3", "Ant-v5", "--steps", "1600", *FLAGS],
 }
-PATIENCE = 120
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -50,78 +49,6 @@ def small_ring() -> Iterator[None]:
         for name, value in RING.items():
             patch.setattr(buffer, name, value)
         yield
-
-
-def start(words: list[str], runs: Path, *program: str) -> subprocess.Popen[str]:
-    """A command as a process of its own."""
-    command = [sys.executable, *(program or ("-c", COMMAND)), *words, "--runs", str(runs)]
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    # Background jobs of some shells ignore SIGINT, and children inherit that.
-    return subprocess.Popen(command, **pipes, text=True, env=dict(os.environ))
-
-
-def wait_for(what: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    """Until `what` is true while the process runs."""
-    end = time.monotonic() + PATIENCE
-    while not what():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.005)
-
-
-def only_run(runs: Path) -> RunDirectory:
-    """The only run below a folder."""
-    (config,) = runs.rglob("config.json")
-    return RunDirectory(config.parent)
-
-
-def litter(directory: RunDirectory) -> list[Path]:
-    return list(directory.path.rglob(f"*{storage.TEMPORARY}"))
-
-
-def saved_step(directory: RunDirectory) -> int:
-    """Step of the newest checkpoint; reading it fails if it is not whole."""
-    progress = storage.read(directory.state_file, "checkpoint").table["progress"]
-    return sum(member["steps"] for member in progress["members"]) + progress["selection_steps"]
-
-
-def training(runs: Path) -> bool:
-    """Whether the only run below a folder has a checkpoint and a process that goes on with it."""
-    return any(run.in_use() and run.state_file.exists() for run in find_all(runs))
-
-
-def _has_saved_beyond(directory: RunDirectory, step: int) -> bool:
-    return saved_step(directory) > step
-
-
-def kill_and_resume(env: str, tmp_path: Path, kills: int, seed: int) -> RunDirectory:
-    """Kill a run many times, most of them after it has saved something new; then let it end."""
-    rng = np.random.default_rng(seed)
-    runs, words, saved = tmp_path / "killed", KILLED[env], 0
-    for number in range(kills):
-        process = start(words, runs)
-        wait_for(partial(training, runs), process)
-        directory = only_run(runs)
-        words = ["resume", str(directory.path)]
-        if number % 3:  # the others die wherever they are, early ones before the first save
-            wait_for(partial(_has_saved_beyond, directory, saved), process)
-        time.sleep(float(rng.uniform(0, 0.6)))
-        process.kill()
-        process.communicate(timeout=PATIENCE)
-        assert process.returncode == -signal.SIGKILL
-        assert not directory.in_use()
-        step = saved_step(directory)
-        assert step > saved if number % 3 else step >= saved
-        saved = step
-    trainer = Trainer.resume(directory.path)
-    assert trainer.notes == []
-    assert trainer.progress.step == saved > 0
-    assert litter(directory) == []
-    run_to_end(trainer)
-    assert trainer.finished
-    assert not directory.in_use()
-    assert litter(directory) == []
-    return directory
 
 
 Undisturbed = Callable[[str], RunDirectory]
@@ -142,29 +69,24 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
 
 @pytest.mark.parametrize("env", ["HalfCheetah-v5", pytest.param("Ant-v5", marks=pytest.mark.slow)])
 def test_killed_run_equals_undisturbed(env: str, tmp_path: Path, undisturbed: Undisturbed) -> None:
-    assert_same(undisturbed(env), kill_and_resume(env, tmp_path, kills=3, seed=len(env)))
+    assert_same(undisturbed(env), kill_and_resume(KILLED[env], tmp_path, kills=3, seed=len(env)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("env", KILLED)
-def test_run_killed_often_equals_undisturbed(
-    env: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(KILLED, env, [*KILLED[env], "--steps", "120000"])
-    directory = kill_and_resume(env, tmp_path, kills=40, seed=3)
-    assert main([*KILLED[env], "--runs", str(tmp_path / "whole")]) == 0
+def test_run_killed_often_equals_undisturbed(env: str, tmp_path: Path) -> None:
+    words = [*KILLED[env], "--steps", "120000"]
+    directory = kill_and_resume(words, tmp_path, kills=40, seed=3)
+    assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
     assert_same(only_run(tmp_path / "whole"), directory)
 
 
 @pytest.mark.slow
-def test_killed_run_with_models_equals_undisturbed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_run_with_models_equals_undisturbed(tmp_path: Path) -> None:
     """STEVE's models, their optimiser and the rows that each learns from go on as they were."""
     words = ["train", "multi-steve-td3", "Hopper-v5", "--steps", "4000", *FLAGS]
     words += ["--model-hidden", "8", "--head-hidden", "8", "--critic-members", "2"]
-    monkeypatch.setitem(KILLED, "Hopper-v5", words)
-    killed = kill_and_resume("Hopper-v5", tmp_path, kills=3, seed=1)
+    killed = kill_and_resume(words, tmp_path, kills=3, seed=1)
     assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
     assert_same(only_run(tmp_path / "whole"), killed)
 
@@ -180,10 +102,10 @@ def test_signals_save_and_end(tmp_path: Path, undisturbed: Undisturbed) -> None:
     runs, words = tmp_path / "stopped", KILLED["HalfCheetah-v5"]
     steps = [0]
     for number, code in ENDS.items():
-        process = start(words, runs)
+        process = launch(words, runs)
         wait_for(partial(training, runs), process)
         directory = only_run(runs)
-        wait_for(partial(_has_saved_beyond, directory, steps[-1]), process)
+        wait_for(partial(has_saved_beyond, directory, steps[-1]), process)
         process.send_signal(number)
         out, err = process.communicate(timeout=PATIENCE)
         assert (process.returncode, err) == (code, "")
@@ -202,7 +124,7 @@ def test_signals_save_and_end(tmp_path: Path, undisturbed: Undisturbed) -> None:
 @pytest.mark.parametrize("number", ENDS)
 def test_signal_before_there_is_a_run(number: signal.Signals, tmp_path: Path) -> None:
     """While JAX is imported, which a signal must neither break nor lose: the run saves and ends."""
-    process = start(KILLED["HalfCheetah-v5"], tmp_path, "-m", "pacesetter")
+    process = launch(KILLED["HalfCheetah-v5"], tmp_path, "-m", "pacesetter")
     libraries = Path(f"/proc/{process.pid}/maps")
     wait_for(lambda: "jaxlib" in libraries.read_text(), process)
     assert not any(find_all(tmp_path))
@@ -216,7 +138,7 @@ def test_signal_before_there_is_a_run(number: signal.Signals, tmp_path: Path) ->
 def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
     """The first waits for a long evaluation to end, the second for nothing; resume goes on."""
     words = ["train", "td3", "HalfCheetah-v5", "--steps", "500", *FLAGS]
-    process = start([*words, "--eval-episodes", "10000"], tmp_path)
+    process = launch([*words, "--eval-episodes", "10000"], tmp_path)
     wait_for(partial(training, tmp_path), process)
     process.send_signal(number)
     time.sleep(0.5)

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from short_runs import TINY, assert_same, run_to_end
+from stopping import stop_at
 
-from conftest import TINY, assert_same, run_to_end
 from pacesetter.replay import buffer
 from pacesetter.training.trainer import Trainer
 
@@ -93,20 +94,6 @@ CASES = {
 def start(case: str, runs: Path, name: str) -> Trainer:
     settings = {**TINY, "steps": 1_500, "algorithm": "td3", "name": name, **CASES[case]}
     return Trainer(settings.pop("algorithm"), settings.pop("env"), runs=runs, **settings)
-
-
-def stop_at(trainer: Trainer, tick: int) -> None:
-    """Run until a tick has passed, then end as a signal would."""
-    once = trainer.ensemble.tick
-
-    def tick_and_stop() -> object:
-        selection = once()
-        if trainer.progress.tick >= tick:
-            trainer.stop()
-        return selection
-
-    trainer.ensemble.tick = tick_and_stop
-    run_to_end(trainer)
 
 
 def test_killed_before_the_first_checkpoint(runs: Path) -> None:
