@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import KEY, SPEC, member, perceptron, quantile_loss, random_batch, random_state
+from numeric import KEY, SPEC, member, perceptron, quantile_loss, random_batch, random_state, says
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import td3
@@ -104,7 +104,7 @@ def test_heads_by_the_settings() -> None:
 
 def test_head_of_quantiles_has_their_loss(rng: np.random.Generator) -> None:
     """For a target as `min_q` leads to it, which is (M, B)."""
-    outputs, target = rng.normal(size=(2, 4, 5)), rng.normal(size=(5, 4))
+    outputs, target = np.float32(rng.normal(size=(2, 4, 5))), np.float32(rng.normal(size=(5, 4)))
     found = critic_heads.choose(5, "uniform").loss(outputs, target)
     expected = critic_heads.quantile_huber(outputs, target.T)
     jax.tree.map(np.testing.assert_array_equal, found, expected)
@@ -133,18 +133,12 @@ def test_lap_in_a_learner(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(fed, errors.max(axis=0))
 
 
-def with_outputs(network: Any, outputs: Any) -> Any:
-    """Critics that say the same of everything: `outputs` (critics, M)."""
-    *hidden, last = jax.tree.map(np.zeros_like, network)
-    return (*hidden, last | {"bias": np.asarray(outputs, last["bias"].dtype)})
-
-
 @pytest.mark.parametrize("kind", [TD3, SAC])
 def test_target_is_a_distribution(kind: Any, rng: np.random.Generator) -> None:
     """r + discount * each number of the lower twin, after a fall r alone, for SAC less entropy."""
     learner = kind(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
     state = random_state(learner, rng, "actor")
-    twins = with_outputs(state.target_critic, [DISTRIBUTION + 10, DISTRIBUTION])
+    twins = says(state.target_critic, [DISTRIBUTION + 10, DISTRIBUTION])
     state = state._replace(target_critic=twins)
     batch = random_batch(rng, SPEC, 8)._replace(reward=np.full(8, 1.5))
     batch.discount[:2] = 0.99, 0
@@ -160,7 +154,7 @@ def test_target_is_a_distribution(kind: Any, rng: np.random.Generator) -> None:
 def test_value_of_quantiles_is_their_mean(kind: Any, rng: np.random.Generator) -> None:
     learner = kind(SPEC, kind.Hyper(hidden=(6,), quantiles=5))
     state = random_state(learner, rng)
-    critic = with_outputs(state.critic, [DISTRIBUTION, DISTRIBUTION - 1])
+    critic = says(state.critic, [DISTRIBUTION, DISTRIBUTION - 1])
     batch = random_batch(rng, SPEC, 4)
     values = jax.jit(learner.values)(critic, batch.observation, batch.action)
     np.testing.assert_allclose(values, [[3] * 4, [2] * 4], rtol=1e-6)

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from numeric import near
 from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms.sunrise import Sunrise
@@ -46,6 +47,8 @@ ASSESSED = {"assess": 5, "assess_after": 0, "warmup": 500, "steps": 1_500, "expl
 # Blocks of the usual 1,000 steps would leave it with the first policy to the end.
 OFFICIAL = {"reference": "official", "update_every": 100, "warmup": 500, "steps": 1_500}
 MODELS = {"model_hidden": (32,), "head_hidden": (16,), "critic_members": 2}
+# As many updates as the others make, in half the steps.
+MANY = {"critics": 5, "updates_per_step": 2.0, "policy_delay": 2, "steps": 700}
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": ("td3", {}),
     "ddpg": ("ddpg", {}),
@@ -62,6 +65,7 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "sunrise": ("sunrise", NO_ENTROPY | FEW),
     "sunrise-official": ("sunrise", NO_ENTROPY | FEW | OFFICIAL),
     "sunrise-td3": ("sunrise-td3", FEW),
+    "redq": ("redq:REDQ", NO_ENTROPY | MANY),
     "steve": ("steve", MODELS | {"exploration_noise": 2.0}),
     "steve-td3": ("steve-td3", MODELS),
 }
@@ -75,7 +79,7 @@ def kinds(*quick: str) -> Any:
 
 
 both = kinds("td3", "ddpg")
-every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter", "ou", "assess")
+every = kinds("td3", "ddpg", "sac", "crossq", "quantiles", "parameter", "ou", "assess", "redq")
 
 
 def learn(
@@ -101,10 +105,6 @@ def values(trainer: Trainer, observation: float, actions: Any = (-0.8, 0.0, 0.8)
 def members_values(algorithm: Sunrise) -> Any:
     """The values of all learners in an ensemble (N, critics, actions)."""
     return jax.vmap(algorithm.base.values, (0, None, None))
-
-
-def near(found: Any, expected: Any) -> None:
-    np.testing.assert_allclose(found, np.broadcast_to(expected, np.shape(found)), atol=0.1, rtol=0)
 
 
 @both

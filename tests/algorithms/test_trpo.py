@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from broken_envs import Late
 from jax.flatten_util import ravel_pytree
+from numeric import near
 from scipy.stats import norm
 from short_runs import assert_same, log, run_to_end
 from stopping import kill_and_resume, only_run, stop_at
@@ -327,10 +328,6 @@ def values(trainer: Trainer, *observations: float) -> Any:
     seen = (np.array(observations, np.float32)[:, None] - mean) / deviation
     algorithm: Any = trainer.ensemble.algorithm
     return algorithm.values(trainer.ensemble.states[0], jnp.array(seen))
-
-
-def near(found: Any, expected: Any) -> None:
-    np.testing.assert_allclose(found, np.broadcast_to(expected, np.shape(found)), atol=0.1, rtol=0)
 
 
 def test_probe_constant_reward(runs: Path) -> None:

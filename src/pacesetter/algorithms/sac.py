@@ -26,6 +26,8 @@ from pacesetter.networks import critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, ActorCritic, LearningRate, Warmup
 
+NEXT_Q = 1  # what is folded into a target's key for `next_q`; the action has the key itself
+
 
 @settings(frozen=True, kw_only=True, config=STRICT)
 class Hyper(ActorCritic):
@@ -107,11 +109,14 @@ class SAC(StochasticLearner):
         """Soft target (B,), of quantiles (M, B)."""
         action, bonus = self.next_action(state, batch.next_observation, key)
         outputs = mlp.each(mlp.outputs, state.target_critic, batch.next_observation, action)
-        next_q = self.next_q(outputs, key) + bonus
+        next_q = self.next_q(outputs, jax.random.fold_in(key, NEXT_Q)) + bonus
         return jax.lax.stop_gradient(batch.reward + batch.discount * next_q)
 
     def next_q(self, outputs: Array, key: Array) -> Array:
-        """The next value (B,), of quantiles (M, B), from all target critics' outputs."""
+        """The next value (B,), of quantiles (M, B), from all target critics' outputs.
+
+        Learners that choose among the critics at random have a key of their own for it.
+        """
         return self.head.min_q(outputs)
 
     def actor_value(self, values: Array) -> Array:
