@@ -57,6 +57,12 @@ class Hyper(OffPolicy):
     renorm_after: Count = Field(
         100_000, ge=0, description="a network's updates with plain batch norm before renorm"
     )
+    weight_norm: bool = Field(
+        False, description="keep the weights into every hidden unit at length 1"
+    )
+    next_batch_gradient: bool = Field(
+        True, description="gradient through (s', a') where they shape a batch's mean and variance"
+    )
     exploration: Exploration = Field(
         "policy", description="fixed: the stochastic policy explores by itself"
     )
@@ -94,11 +100,15 @@ class CrossQ(StochasticLearner):
     def init(self, key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
         (observation, action), hyper = self.spec, self.hyper
-        actor = batch_renorm.init(actor_key, observation, hyper.hidden, 2 * action)
+        actor = self._unit_length(
+            batch_renorm.init(actor_key, observation, hyper.hidden, 2 * action)
+        )
         new_critic = partial(
             batch_renorm.init, inputs=observation + action, hidden=hyper.critic_hidden, outputs=1
         )
-        critic = jax.vmap(new_critic)(jax.random.split(critic_key, hyper.critics))
+        critic = self._unit_length(
+            jax.vmap(new_critic)(jax.random.split(critic_key, hyper.critics))
+        )
         log_alpha = jnp.log(jnp.asarray(hyper.initial_alpha, jnp.float32))
         return State(
             actor=actor,
@@ -134,16 +144,18 @@ class CrossQ(StochasticLearner):
         next_action, log_prob = gaussian.sample(
             batch_renorm.fold(state.actor), batch.next_observation, key
         )
-        inputs = jnp.concatenate(
-            [
-                jnp.concatenate([batch.observation, batch.action], axis=-1),
-                jnp.concatenate([batch.next_observation, next_action], axis=-1),
-            ]
+        halves = (
+            jnp.concatenate([batch.observation, batch.action], axis=-1),
+            jnp.concatenate([batch.next_observation, next_action], axis=-1),
         )
-        forward = partial(batch_renorm.train, warm=state.updates >= self.hyper.renorm_after)
+        if self.hyper.next_batch_gradient:
+            train, inputs = batch_renorm.train, (jnp.concatenate(halves),)
+        else:
+            train, inputs = batch_renorm.train_beside, halves
+        forward = partial(train, warm=state.updates >= self.hyper.renorm_after)
 
         def loss(critic: mlp.Network) -> tuple[Array, Any]:
-            outputs, trained = mlp.each(forward, critic, inputs)
+            outputs, trained = mlp.each(forward, critic, *inputs)
             now, later = jnp.split(outputs, 2, axis=1)
             next_q = self.head.min_q(later) - jnp.exp(state.log_alpha) * log_prob
             target_q = jax.lax.stop_gradient(batch.reward + batch.discount * next_q)
@@ -155,6 +167,7 @@ class CrossQ(StochasticLearner):
         )
         adam = self._adam(self.hyper.critic_learning_rate)
         critic, opt_state = mlp.apply_gradient(adam, state.critic, gradient, state.critic_opt_state)
+        critic = self._unit_length(critic)
         state = state._replace(
             critic=batch_renorm.with_statistics(critic, trained),
             critic_opt_state=opt_state,
@@ -176,10 +189,16 @@ class CrossQ(StochasticLearner):
         (value, (log_prob, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
         adam = self._adam(self.hyper.actor_learning_rate)
         actor, opt_state = mlp.apply_gradient(adam, state.actor, gradient, state.actor_opt_state)
-        actor = batch_renorm.with_statistics(actor, trained)
+        actor = batch_renorm.with_statistics(self._unit_length(actor), trained)
         state = state._replace(actor=actor, actor_opt_state=opt_state)
         losses = {"actor_loss": value, "alpha": alpha, "entropy": -log_prob}
         return self.fit_temperature(state, log_prob), losses
+
+    def _unit_length(self, network: mlp.Network) -> mlp.Network:
+        if not self.hyper.weight_norm:
+            return network
+        # The head's length is the size of the values, which no normalisation behind it cancels.
+        return batch_renorm.unit_length(network, head=False)
 
     def _adam(self, rate: float) -> optax.GradientTransformation:
         return optax.adam(rate, b1=self.hyper.adam_momentum)

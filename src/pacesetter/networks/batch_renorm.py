@@ -51,11 +51,45 @@ def train(network: Network, x: Array, warm: Array) -> tuple[Array, Network]:
     return x, tuple(layers)
 
 
+def train_beside(network: Network, x: Array, beside: Array, warm: Array) -> tuple[Array, Network]:
+    """As `train` on x (B, inputs) and as many rows beside them, but no gradient flows through the
+    latter: in every layer they are constants that take part in the batch's mean and variance.
+
+    Outputs (2 B, outputs), x's first. Gradients then cost half of what those of all rows do.
+    """
+    layers: list[Layer] = []
+    for index, layer in enumerate(network):
+        rows = (x, beside) if index == 0 else (jax.nn.relu(x), jax.nn.relu(beside))
+        (x, beside), statistics = _renormalize(layer, rows, moments_beside(*rows), warm)
+        fixed = jax.lax.stop_gradient(layer)
+        x = (x * layer["scale"] + layer["offset"]) @ layer["kernel"] + layer["bias"]
+        beside = (beside * fixed["scale"] + fixed["offset"]) @ fixed["kernel"] + fixed["bias"]
+        beside = jax.lax.stop_gradient(beside)
+        layers.append(layer | statistics)
+    return jnp.concatenate([x, beside]), tuple(layers)
+
+
+def moments_beside(x: Array, beside: Array) -> tuple[Array, Array]:
+    """Mean and variance (inputs,) of x (B, inputs) and as many constant rows together."""
+    beside = jax.lax.stop_gradient(beside)
+    mean = (x.mean(axis=0) + beside.mean(axis=0)) / 2
+    squares = ((x - mean) ** 2).mean(axis=0) + ((beside - mean) ** 2).mean(axis=0)
+    return mean, squares / 2
+
+
 def renormalize(layer: Layer, x: Array, warm: Array) -> tuple[Array, Layer]:
     """x (B, inputs) normalised by its batch, then, if warm, led to what the running statistics
     would have made of it, within limits; and these statistics moved towards the batch's.
     """
-    mean, variance = x.mean(axis=0), x.var(axis=0)
+    (x,), moved = _renormalize(layer, (x,), (x.mean(axis=0), x.var(axis=0)), warm)
+    return x, moved
+
+
+def _renormalize(
+    layer: Layer, rows: tuple[Array, ...], moments: tuple[Array, Array], warm: Array
+) -> tuple[tuple[Array, ...], Layer]:
+    """The same of several arrays of rows, whose moments are given."""
+    mean, variance = moments
     deviation = jnp.sqrt(variance + EPSILON)
     running = jnp.sqrt(layer["variance"] + EPSILON)
     stretch = jnp.clip(deviation / running, 1 / MOST_STRETCH, MOST_STRETCH)
@@ -65,7 +99,25 @@ def renormalize(layer: Layer, x: Array, warm: Array) -> tuple[Array, Layer]:
         "mean": MOMENTUM * layer["mean"] + (1 - MOMENTUM) * mean,
         "variance": MOMENTUM * layer["variance"] + (1 - MOMENTUM) * variance,
     }
-    return (x - mean) / deviation * stretch + shift, jax.lax.stop_gradient(moved)
+    normed = tuple((x - mean) / deviation * stretch + shift for x in rows)
+    return normed, jax.lax.stop_gradient(moved)
+
+
+def unit_length(network: Network, head: bool) -> Network:
+    """The network with the weights into every hidden unit, its bias among them, at length 1.
+
+    Batch norm behind the unit cancels their length, which only decides how far a step of Adam
+    turns them. With `head` the weights into every output too, but not its bias.
+    """
+    hidden = [_unit_length(layer, with_bias=True) for layer in network[:-1]]
+    return (*hidden, _unit_length(network[-1], with_bias=False) if head else network[-1])
+
+
+def _unit_length(layer: Layer, with_bias: bool) -> Layer:
+    kernel, bias = layer["kernel"], layer["bias"]
+    length = jnp.sqrt((kernel**2).sum(axis=-2) + (bias**2 if with_bias else 0))
+    divided = layer | {"kernel": kernel / length[..., None, :]}
+    return divided | {"bias": bias / length} if with_bias else divided
 
 
 def with_statistics(network: Network, trained: Network) -> Network:
