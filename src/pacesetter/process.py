@@ -1,4 +1,4 @@
-"""What a command settles for its process: the number of threads, and how signals end it."""
+"""A command's process: its cores and threads, and how signals end it."""
 
 import os
 import signal
@@ -6,18 +6,33 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from types import FrameType
 
+from pacesetter.errors import UsageError
 
-def fix_threads(count: int | None = None) -> None:
-    """Fix the size of XLA's thread pool, which decides result bits, before JAX is imported."""
-    if count is not None:
-        os.environ["NPROC"] = str(count)
-    os.environ.setdefault("NPROC", str(len(os.sched_getaffinity(0))))
+
+def cores() -> list[int]:
+    """The cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))
 
 
 def threads() -> int:
-    """How many threads this process may keep busy."""
-    cores = len(os.sched_getaffinity(0))
-    return max(int(os.environ.get("NPROC", cores)), 1)
+    """The size of XLA's thread pool on a CPU: NPROC, by default one thread per core.
+
+    It decides the last bits of results. Raises UsageError if NPROC is no such number.
+    """
+    text = os.environ.get("NPROC", "").strip()
+    if not text:
+        return len(cores())
+    if not (text.isdecimal() and int(text) >= 1):
+        raise UsageError(
+            f"NPROC: must be a whole number of threads, at least 1, got '{text}'; "
+            "unset it for one thread per core"
+        )
+    return int(text)
+
+
+def fix_threads(count: int | None = None) -> None:
+    """Fix the number of threads before JAX is imported, so that XLA takes it too."""
+    os.environ["NPROC"] = str(count or threads())
 
 
 @contextmanager

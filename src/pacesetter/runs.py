@@ -18,6 +18,7 @@ from typing import Any
 
 from pacesetter.config import Config, settle
 from pacesetter.errors import UsageError
+from pacesetter.process import cores, threads
 from pacesetter.storage import TEMPORARY, write_atomically
 
 SCHEMA = 1
@@ -223,7 +224,7 @@ def provenance(backend: str | None) -> Row:
         "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
-        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
+        "machine": f"{platform.machine()}, {len(cores())} cores",
         "backend": backend,
     }
 
@@ -241,11 +242,6 @@ def _commit() -> str | None:
     describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
     return found.stdout.strip() or None
-
-
-def threads() -> int:
-    """Size of XLA's thread pool, which decides result bits on a CPU."""
-    return int(os.environ.get("NPROC") or len(os.sched_getaffinity(0)))
 
 
 def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:

@@ -379,7 +379,7 @@ def test_every_flag_is_tried() -> None:
 
 
 # Those of learners with a state of their own kind are built beside the other tests of it.
-BUILT = [n for n, table in config.presets().items() if not algorithms.alone(table["algorithm"])]
+BUILT = [n for n, table in config.presets().items() if not algorithms.single_member(table["algorithm"])]
 
 
 @pytest.mark.parametrize("name", [*BUILT, *(f"multi-{name}" for name in BUILT)])

@@ -8,7 +8,7 @@ from typing import Any
 from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
 from pacesetter.config import Run, preset_layers, settle
 from pacesetter.errors import UsageError
-from pacesetter.process import exit_code, fix_threads, stopping
+from pacesetter.process import cores, exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 from pacesetter.study.bench import suite as suites
 from pacesetter.study.bench.suite import Suite
@@ -89,7 +89,7 @@ def _print(suite: Suite, jobs: list[suites.Job], form: str) -> int:
 
 def _bench(jobs: list[suites.Job], found: dict[str, Any], words: list[str]) -> int:
     from pacesetter.cli.bench_progress import display
-    from pacesetter.study.bench.executors import Local, Ray, cores
+    from pacesetter.study.bench.executors import Local, Ray
     from pacesetter.study.bench.queue import Bench
 
     if found["jobs"] is not None and found["jobs"] < 1:

@@ -78,7 +78,7 @@ def _begin(words: list[str]) -> tuple["Trainer", bool]:
         command.parse(words)
     algorithm, env, rest = words[0], words[1], words[2:]
     base, _ = preset_layers(algorithm, env)
-    fix_threads(None)
+    fix_threads()
     defaults = settle(algorithm, env).settings()
     command.prog = f"pacesetter train {algorithm} {env}"
     add_settings(command, "the run", Run, defaults)

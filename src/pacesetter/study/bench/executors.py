@@ -14,13 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.process import cores
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
-
-
-def cores() -> list[int]:
-    """Cores that this process may use."""
-    return sorted(os.sched_getaffinity(0))
 
 
 class Local:
