@@ -99,7 +99,7 @@ class Config(NamedTuple):
     hyper: Any
 
     @property
-    def unit(self) -> int:
+    def steps_per_count(self) -> int:
         """Steps of all members that budget and clocks count as one."""
         return self.run.members if self.run.count == "member" else 1
 
@@ -110,7 +110,7 @@ class Config(NamedTuple):
         return self.hyper.warmup if after is None else after
 
     def settings(self) -> Settings:
-        """All settings as one flat table, which `settle` takes back."""
+        """All settings as one flat table, which `resolve` takes back."""
         return asdict(self.run) | asdict(self.hyper)
 
 
@@ -162,7 +162,7 @@ def read_file(path: Path, name: str | None = None) -> Settings:
     return {key.replace("-", "_"): value for key, value in found.items()}
 
 
-def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
+def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     """Merge defaults, presets and the given layers (later ones win) and check the result once."""
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper

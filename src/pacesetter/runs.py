@@ -16,7 +16,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from pacesetter.config import Config, settle
+from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
 from pacesetter.process import cores, threads
 from pacesetter.storage import TEMPORARY, write_atomically
@@ -134,7 +134,7 @@ class RunDirectory:
         """The run's checked settings."""
         settings = self.settings()
         try:
-            return settle(settings["algorithm"], settings["env"], settings)
+            return resolve(settings["algorithm"], settings["env"], settings)
         except KeyError as error:
             raise UsageError(f"{self.config_file}: damaged: {error} is missing") from None
 

@@ -15,7 +15,7 @@ from pacesetter import algorithms
 from pacesetter.algorithms.steve import STEVE, combine
 from pacesetter.algorithms.td3 import State
 from pacesetter.batch import Batch, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.dynamics.model import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.learner.compiled import inherit
@@ -376,5 +376,5 @@ def test_settings_that_cannot_work_are_refused() -> None:
         ("steve", {"policy_delay": 2}, "policy_delay: is fixed"),
     ):
         with pytest.raises(UsageError, match=message):
-            settle(name, "Hopper-v5", settings)
-    assert settle("steve-td3", "Hopper-v5", {"horizon": 0, "critic_members": 1}).hyper.horizon == 0
+            resolve(name, "Hopper-v5", settings)
+    assert resolve("steve-td3", "Hopper-v5", {"horizon": 0, "critic_members": 1}).hyper.horizon == 0

@@ -21,7 +21,7 @@ from pacesetter.algorithms import ddpg
 from pacesetter.batch import Spec
 from pacesetter.cli.flags import split_env_kwargs
 from pacesetter.cli.main import VERBS, main
-from pacesetter.config import Run, settle
+from pacesetter.config import Run, resolve
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.runs import RunDirectory, find
@@ -218,14 +218,14 @@ DURATIONS = {"90": 90, "90s": 90, "5m": 300, "2h": 7_200, "1d": 86_400, "0.5h": 
 
 @pytest.mark.parametrize("text", COUNTS)
 def test_counts(text: str) -> None:
-    run, hyper = settle("td3", "X-v0", {"steps": text, "replay_size": text})
+    run, hyper = resolve("td3", "X-v0", {"steps": text, "replay_size": text})
     assert run.steps == hyper.replay_size == COUNTS[text]
     assert type(run.steps) is int
 
 
 @pytest.mark.parametrize("text", DURATIONS)
 def test_durations(text: str) -> None:
-    run, _ = settle("td3", "X-v0", {"time": text, "checkpoint_every": text})
+    run, _ = resolve("td3", "X-v0", {"time": text, "checkpoint_every": text})
     assert run.time == run.checkpoint_every == DURATIONS[text]
 
 
@@ -379,13 +379,15 @@ def test_every_flag_is_tried() -> None:
 
 
 # Those of learners with a state of their own kind are built beside the other tests of it.
-BUILT = [n for n, table in config.presets().items() if not algorithms.single_member(table["algorithm"])]
+BUILT = [
+    n for n, table in config.presets().items() if not algorithms.single_member(table["algorithm"])
+]
 
 
 @pytest.mark.parametrize("name", [*BUILT, *(f"multi-{name}" for name in BUILT)])
 def test_every_preset_builds(name: str) -> None:
     """On HalfCheetah; its values are those of the file."""
-    run, hyper = settle(name, "HalfCheetah-v5")
+    run, hyper = resolve(name, "HalfCheetah-v5")
     learner = algorithms.find(run.algorithm).build(Spec(17, 6), hyper)
     state = jax.eval_shape(learner.init, jax.random.key(0))
     assert state.actor[0]["kernel"].shape[-2:] == (17, hyper.hidden[0])

@@ -17,7 +17,7 @@ import pytest
 from conftest import TINY
 from pacesetter import algorithms
 from pacesetter.cli.main import main
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import RunDirectory, find, find_all
 from pacesetter.study.bench.suite import TUNING_SEEDS, expand, of_algorithms
@@ -76,7 +76,7 @@ def test_ranges(name: str) -> None:
     assert found
     for key, one in found.items():
         for end in (one.low, one.high):
-            assert getattr(settle(name, "X-v0", {key: end}).hyper, key) == end
+            assert getattr(resolve(name, "X-v0", {key: end}).hyper, key) == end
             assert distribution(one)._contains(end)
     assert key not in ranges(hyper, {key: 1})
 
@@ -95,7 +95,7 @@ def test_a_study(undisturbed: list[Any]) -> None:
     """It begins with the defaults; each trial reports every evaluation."""
     assert [state for state, *_ in undisturbed] == ["COMPLETE"] * 3
     first = undisturbed[0][2]
-    usual = settle("td3", PROBE, FIXED).settings()
+    usual = resolve("td3", PROBE, FIXED).settings()
     assert first == {key: usual[key] for key in first}
     assert first != undisturbed[1][2] != undisturbed[2][2]
     for _, value, _, reported in undisturbed:
@@ -278,7 +278,7 @@ def test_bad_task(env: str, here: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_nothing_left_to_search() -> None:
-    given = {name: getattr(settle("td3", PROBE).hyper, name) for name in
+    given = {name: getattr(resolve("td3", PROBE).hyper, name) for name in
              ranges(algorithms.find("td3").Hyper, {})}  # fmt: skip
     with pytest.raises(UsageError, match="no setting is left to search"):
         study(**given)

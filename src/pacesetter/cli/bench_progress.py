@@ -115,7 +115,7 @@ def _bars(bench: Bench) -> Generator[Show]:
 
 
 def _budget(job: Job) -> int:
-    return job.config.run.steps * job.config.unit
+    return job.config.run.steps * job.config.steps_per_count
 
 
 def _last(directory: RunDirectory) -> tuple[int, str]:

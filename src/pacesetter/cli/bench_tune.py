@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
-from pacesetter.config import Run, preset_layers, settle
+from pacesetter.config import Run, preset_layers, resolve
 from pacesetter.errors import UsageError
 from pacesetter.process import cores, exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
@@ -128,7 +128,7 @@ def tune(words: list[str]) -> int:
         command.parse(words)
     algorithm, env = words[:2]
     fix_threads()
-    defaults = settle(algorithm, env).settings() | {"steps": 100_000}
+    defaults = resolve(algorithm, env).settings() | {"steps": 100_000}
     command.prog = f"pacesetter tune {algorithm} {env}"
     _add_tune_flags(command)
     add_settings(command, "fixed for all trials: the run", Run, defaults)

@@ -66,7 +66,7 @@ def resume(words: list[str]) -> int:
 def _begin(words: list[str]) -> tuple["Trainer", bool]:
     """The new run of `train WORDS`, and whether it is to be quiet."""
     from pacesetter import algorithms
-    from pacesetter.config import Run, preset_layers, settle
+    from pacesetter.config import Run, preset_layers, resolve
 
     command = parser("train ALGO ENV", "Train an algorithm on a task.")
     if len(words) < 2 or words[0].startswith("-") or words[1].startswith("-"):
@@ -79,7 +79,7 @@ def _begin(words: list[str]) -> tuple["Trainer", bool]:
     algorithm, env, rest = words[0], words[1], words[2:]
     base, _ = preset_layers(algorithm, env)
     fix_threads()
-    defaults = settle(algorithm, env).settings()
+    defaults = resolve(algorithm, env).settings()
     command.prog = f"pacesetter train {algorithm} {env}"
     add_settings(command, "the run", Run, defaults)
     add_settings(command, base, algorithms.find(base).Hyper, defaults)

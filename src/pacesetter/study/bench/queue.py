@@ -68,7 +68,7 @@ def is_finished(job: Job) -> bool:
     except (UsageError, *storage.FAULTS):
         return False  # nothing yet, or damaged, which `resume` deals with
     run = job.config.run
-    spent = progress.step >= run.steps * job.config.unit
+    spent = progress.step >= run.steps * job.config.steps_per_count
     late = run.time is not None and progress.wall_seconds >= run.time
     return (spent or late) and progress.last_evaluation == progress.step
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, read_file, settle
+from pacesetter.config import Config, read_file, resolve
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
@@ -105,8 +105,8 @@ def _jobs(name: str, env: str, seeds: list[int], said: Settings, runs: str | Pat
     for key in DECIDED:
         if key in own:
             raise UsageError(f"{key}: is for the entry's name, envs and seeds to say")
-    run, hyper = settle(algorithm, env, own, {"name": name})
-    usual = settle(algorithm, env).settings()
+    run, hyper = resolve(algorithm, env, own, {"name": name})
+    usual = resolve(algorithm, env).settings()
     differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
     for seed in seeds:
         config = Config(replace(run, seed=seed), hyper)

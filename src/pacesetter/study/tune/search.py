@@ -16,7 +16,7 @@ import numpy as np
 
 from pacesetter import algorithms
 from pacesetter.cli.progress import Sink, console
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
@@ -47,7 +47,7 @@ class Tuning:
         self, algorithm: str, env: str, fixed: Settings, trials: int, file: str | Path
     ) -> None:
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
-        self.config, self.file = settle(algorithm, env, fixed), Path(file)
+        self.config, self.file = resolve(algorithm, env, fixed), Path(file)
         self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
         self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
@@ -147,7 +147,7 @@ class Tuning:
         if self._stopping:
             trainer.stop()
         told = self.study.get_trials(deepcopy=False)[trial.number].intermediate_values
-        every = self.config.run.eval_every * self.config.unit
+        every = self.config.run.eval_every * self.config.steps_per_count
         for report in trainer:
             sink(report)
             number = report.step // every
@@ -162,7 +162,7 @@ class Tuning:
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
         given: Settings = {**self.fixed, **trial.params}
         given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
-        config = settle(self.algorithm, self.env, given)
+        config = resolve(self.algorithm, self.env, given)
         directory = RunDirectory.of(self.runs, config)
         if not directory.config_file.exists():
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
