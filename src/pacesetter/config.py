@@ -1,30 +1,30 @@
 """What to train and how: settings merged from many places and checked once."""
 
 import json
-import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from pacesetter import algorithms
+from pacesetter import algorithms, budget
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import ROWS_A_TICK, STRICT, Count, Duration, OffPolicy, OnPolicy, Settings
+from pacesetter.validation import build, fields_of
 
 
-def _rule(value: str) -> str:
+def _check_rule(value: str) -> str:
     if value not in RULES:
         raise unknown("rule", value, RULES)
     return value
 
 
-def _plain(value: dict[str, Any]) -> dict[str, Any]:
+def _check_json(value: dict[str, Any]) -> dict[str, Any]:
     try:
         json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -32,7 +32,7 @@ def _plain(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _of_trials(value: int, info: ValidationInfo) -> int:
+def _check_selects_on_eval(value: int, info: ValidationInfo) -> int:
     if value != SELECT_EVERY and info.data.get("select_on") == "train":
         raise ValueError("is a setting of --select-on eval, not of train")
     return value
@@ -47,7 +47,7 @@ class Run:
 
     algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
-    env_kwargs: Annotated[dict[str, Any], AfterValidator(_plain)] = Field(
+    env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
         default_factory=dict, description="given to gymnasium.make"
     )
     name: str = Field(pattern=r"^\w[\w.-]*$", description="folder of the run below its env")
@@ -55,13 +55,13 @@ class Run:
     time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="every random stream follows from it")
     members: int = Field(1, ge=1, le=1000, description="learners that share the replay")
-    rule: Annotated[str, AfterValidator(_rule)] = Field(
+    rule: Annotated[str, AfterValidator(_check_rule)] = Field(
         "best", description="who starts again from whom; see `pacesetter list rules`"
     )
     select_on: Literal["train", "eval"] = Field(
         "train", description="returns of training episodes, or of extra noise-free ones (counted)"
     )
-    select_every: Annotated[Count, AfterValidator(_of_trials)] = Field(
+    select_every: Annotated[Count, AfterValidator(_check_selects_on_eval)] = Field(
         SELECT_EVERY, ge=1, description="steps between selections on eval"
     )
     select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
@@ -86,10 +86,11 @@ class Run:
     device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
 
 
-# What only members that share a replay need.
-SELECTION = ("select_on", "select_every", "select_window", "select_after", "count_selection_steps")
-OF_MEMBERS = ("members", "rule", *SELECTION, "copy", "same_init")
-OF_ENSEMBLES = (*OF_MEMBERS, "count", "wait", "replay_scope")
+# Settings of members that share a replay, which a learner on rollouts has not.
+ENSEMBLE_SETTINGS = (
+    *("members", "rule", "copy", "same_init", "count", "wait", "replay_scope"),
+    *("select_on", "select_every", "select_window", "select_after", "count_selection_steps"),
+)
 
 
 class Config(NamedTuple):
@@ -100,8 +101,13 @@ class Config(NamedTuple):
 
     @property
     def steps_per_count(self) -> int:
-        """Steps of all members that budget and clocks count as one."""
-        return self.run.members if self.run.count == "member" else 1
+        """Env steps of all members for each one that `--steps` and the intervals count."""
+        return budget.steps_per_count(vars(self.run))
+
+    @property
+    def budget(self) -> int:
+        """Env steps that all members make together, until the run is over."""
+        return budget.budget(vars(self.run))
 
     @property
     def select_after(self) -> int:
@@ -170,7 +176,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     for layer in (*below, *layers):
         merged |= layer
     merged |= {"algorithm": base, "env": env}
-    run_names, hyper_names = names_of(Run), names_of(hyper_type)
+    run_names, hyper_names = fields_of(Run).keys(), fields_of(hyper_type).keys()
     for key in merged:
         if key not in run_names | hyper_names:
             help_of = f"pacesetter train {name} {env} --help"
@@ -178,7 +184,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
     if isinstance(hyper, OffPolicy):
-        _refuse_what_never_meets(run, hyper)
+        _refuse_conflicts(run, hyper)
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
     if isinstance(hyper, OnPolicy):
@@ -189,7 +195,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     return Config(run, hyper)
 
 
-def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
+def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
     if hyper.n_step * run.members > ROWS_A_TICK:
         raise UsageError(
             f"n_step: {hyper.n_step} with {run.members} members; "
@@ -213,39 +219,10 @@ def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
 
 
 def _refuse_ensemble(run: Run) -> None:
-    for field in fields(Run):
-        value = getattr(run, field.name)
-        if field.name in OF_ENSEMBLES and value != (default := _default(field.name)):
+    for name in ENSEMBLE_SETTINGS:
+        value, default = getattr(run, name), fields_of(Run)[name].default
+        if value != default:
             raise UsageError(
-                f"{field.name}: {run.algorithm} trains one member, on rollouts of its own; "
+                f"{name}: {run.algorithm} trains one member, on its own rollouts; "
                 f"must stay {default}, got {value}"
             )
-
-
-def _default(name: str) -> Any:
-    infos: dict[str, Any] = Run.__dict__["__pydantic_fields__"]
-    return infos[name].default
-
-
-def names_of(kind: type) -> set[str]:
-    """Field names of a settings class."""
-    return {field.name for field in fields(kind)}
-
-
-def build(kind: type, table: Settings) -> Any:
-    """Make checked settings, or refuse them in one line that names the field."""
-    infos: dict[str, Any] = kind.__dict__["__pydantic_fields__"]
-    for key, value in table.items():  # Python, and so pydantic, takes True for 1
-        annotation = infos[key].annotation
-        if isinstance(value, bool) and {int, float} & {annotation, *get_args(annotation)}:
-            raise UsageError(f"{key}: should be a number, got {str(value).lower()}")
-    try:
-        return kind(**table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"][:1])
-        if first["type"] == "literal_error":
-            options = re.findall(r"'([^']*)'", first.get("ctx", {})["expected"])
-            raise unknown(field, str(first["input"]), options) from None
-        message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-        raise UsageError(f"{field}: {message}, got {first['input']!r}") from None

@@ -5,27 +5,22 @@ import json
 import os
 import platform
 import re
-import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
-from functools import cache
-from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
-from pacesetter.process import cores, threads
+from pacesetter.provenance import provenance
 from pacesetter.storage import TEMPORARY, write_atomically
+from pacesetter.validation import difference
 
 SCHEMA = 1
 IN_USE = "is in use by"
-PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 # Settings in which the seeds of one name may differ.
-OF_A_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
+FREE_PER_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
 Row = dict[str, Any]
 
 
@@ -51,33 +46,37 @@ class RunDirectory:
 
     def refuse_existing(self, config: Config) -> None:
         """Refuse to train onto a run that is there, and say how to go on instead."""
-        new = json.loads(json.dumps(config.settings()))
         if not self.config_file.exists():
-            self._refuse_strangers(new)
+            self._refuse_other_seeds(config)
             return
-        old = self.settings()
-        differing = [key for key in new if old.get(key) != new[key]]
-        if not differing:
-            raise UsageError(f"run: {self.path} exists; go on with `pacesetter resume {self.path}`")
-        key = differing[0]
-        raise UsageError(
-            f"run: {self.path} exists with {key}={old.get(key)}, not {new[key]}; give this one "
-            f"another --name, or go on with `pacesetter resume {self.path}`"
-        )
+        go_on = f"go on with `pacesetter resume {self.path}`"
+        if found := self.difference_from(config):
+            raise UsageError(
+                f"run: {self.path} exists with {found}; give this one another --name, or {go_on}"
+            )
+        raise UsageError(f"run: {self.path} exists; {go_on}")
 
-    def _refuse_strangers(self, new: Row) -> None:
+    def difference_from(self, config: Config) -> str | None:
+        """The first setting in which the run here differs; None if none does, or no run is here."""
+        if not self.config_file.exists():
+            return None
+        old, new = self.config().settings(), config.settings()
+        return difference(old, new, new)
+
+    def _refuse_other_seeds(self, config: Config) -> None:
         """Refuse to stand beside seeds of the same name that were trained with other settings."""
+        new = json.loads(json.dumps(config.settings()))
         for file in sorted(self.path.parent.glob("*/config.json")):
             try:
                 old = RunDirectory(file.parent).settings()
             except UsageError:  # damaged, which is for its own commands to say
                 continue
-            for key in [key for key in new if key in old and key not in OF_A_SEED]:
-                if old[key] != new[key]:
-                    raise UsageError(
-                        f"run: {file.parent} has {key}={old[key]}, not {new[key]}; give runs with "
-                        "other settings another --name"
-                    )
+            # A setting that an older version did not have is not a difference.
+            shared = [key for key in new if key in old and key not in FREE_PER_SEED]
+            if found := difference(old, new, shared):
+                raise UsageError(
+                    f"run: {file.parent} has {found}; give runs with other settings another --name"
+                )
 
     def create(self, config: Config, backend: str | None = None) -> None:
         """Make the folder and write its config; the only step that starts a run on disk."""
@@ -215,33 +214,6 @@ class RunDirectory:
         except OSError:
             return True
         return False
-
-
-def provenance(backend: str | None) -> Row:
-    """What a result needs to be repeated: command, versions, commit, machine, threads, backend."""
-    return {
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "versions": versions(),
-        "commit": _commit(),
-        "threads": threads(),
-        "machine": f"{platform.machine()}, {len(cores())} cores",
-        "backend": backend,
-    }
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide results."""
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
-
-
-def _commit() -> str | None:
-    checkout = Path(__file__).parents[2]
-    if not (checkout / ".git").exists() or not (git := shutil.which("git")):
-        return None
-    describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
-    return found.stdout.strip() or None
 
 
 def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:

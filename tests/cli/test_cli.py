@@ -26,6 +26,7 @@ from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.runs import RunDirectory, find
 from pacesetter.training.trainer import Trainer
+from pacesetter.validation import fields_of
 
 PROBE = "broken_envs:Probe-v0"
 SMALL = [
@@ -153,7 +154,7 @@ def test_help_of_train_has_every_setting(command: Command) -> None:
 
 NO_JAX = """
 import sys
-from pacesetter.cli import main
+from pacesetter.cli.main import main
 for words in ["--help", "--version", "train --help", "resume --help", "eval --help", "list --help",
               "show --help", "bench --help", "tune --help", "list algorithms", "list envs",
               "list rules", "list presets", "list suites", "list runs"]:
@@ -374,7 +375,7 @@ def test_flags_are_settings(algorithm: str, command: Command) -> None:
 def test_every_flag_is_tried() -> None:
     """A new setting needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
-    settings = config.names_of(Run) | config.names_of(ddpg.Hyper)
+    settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
     assert settings - tried == {"algorithm", "env", "env_kwargs"}
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from tabulate import tabulate
 
+from pacesetter.budget import budget, is_spent
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
 
@@ -60,11 +61,9 @@ def runs(folder: str) -> list[str]:
     rows: list[tuple[Any, ...]] = []
     for run in find_all(folder):
         try:
-            step, budget, result = _state(run)
+            rows.append((run.path, *_state(run)))
         except (UsageError, KeyError, TypeError) as error:
             rows.append((run.path, "-", f"damaged or foreign: {error}", "-"))
-            continue
-        rows.append((run.path, f"{step:,} of {budget:,}", _status(run, step, budget), result))
     if not rows:
         return [f"no runs below {folder}"]
     return _table(rows, ("run", "steps", "state", "return"))
@@ -80,7 +79,7 @@ def describe(run: RunDirectory) -> list[str]:
 
 def _describe(run: RunDirectory) -> list[str]:
     record = run.record()
-    step, budget, _ = _state(run)
+    steps, state, _ = _state(run)
     rows = run.rows()
     evaluations = [row for row in rows if row["kind"] == "eval"]
     selections = [row for row in rows if row["kind"] == "select"]
@@ -99,7 +98,7 @@ def _describe(run: RunDirectory) -> list[str]:
     made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
     made += [(name, number) for name, number in record["versions"].items()]
     return [
-        f"{run.path}: {step:,} of {budget:,} steps, {_status(run, step, budget)}",
+        f"{run.path}: {steps} steps, {state}",
         "",
         *_table(recent, ("step", "return", "std", "episodes")),
         "",
@@ -111,21 +110,15 @@ def _describe(run: RunDirectory) -> list[str]:
     ]
 
 
-def _state(run: RunDirectory) -> tuple[int, int, str]:
+def _state(run: RunDirectory) -> tuple[str, str, str]:
+    """How far a run is, whether it goes on, and its last evaluation."""
     settings, rows = run.settings(), run.rows()
-    budget = settings["steps"] * (settings["members"] if settings["count"] == "member" else 1)
+    last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
+    over = is_spent(settings, last["step"], last["wall_seconds"])
+    state = "running" if run.in_use() else "finished" if over else "stopped"
     means = [row["mean"] for row in rows if row["kind"] == "eval"]
-    return (rows[-1]["step"] if rows else 0), budget, f"{means[-1]:.1f}" if means else "-"
-
-
-def _status(run: RunDirectory, step: int, budget: int) -> str:
-    if run.in_use():
-        return "running"
-    if step >= budget:
-        return "finished"
-    limit = run.settings()["time"]
-    late = limit is not None and any(row["wall_seconds"] >= limit for row in run.rows()[-1:])
-    return "finished" if late else "stopped"
+    steps = f"{last['step']:,} of {budget(settings):,}"
+    return steps, state, f"{means[-1]:.1f}" if means else "-"
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:

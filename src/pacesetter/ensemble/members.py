@@ -57,7 +57,7 @@ class Ensemble:
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.unchanged = self.normalizer.statistics()
-        self.budget = run.steps * config.steps_per_count
+        self.budget = config.budget
         self.horizon = (hyper.replay_horizon or 0) * config.steps_per_count  # 0: no weights
         self.replays: list[Replay] = []
         self.workers = ThreadPoolExecutor(min(run.members, threads()))

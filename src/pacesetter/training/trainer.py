@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import jax
 
+from pacesetter.budget import out_of_time
 from pacesetter.config import read_file, resolve
 from pacesetter.ensemble.members import Ensemble
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
@@ -15,7 +16,8 @@ from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
-from pacesetter.runs import RunDirectory, find, versions
+from pacesetter.provenance import versions
+from pacesetter.runs import RunDirectory, find
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
@@ -161,8 +163,7 @@ class Trainer:
     @property
     def finished(self) -> bool:
         """Whether the budget of steps, with the updates they owe, or of time is spent."""
-        limit = self.config.run.time
-        if limit is not None and self.progress.wall_seconds >= limit:
+        if out_of_time(vars(self.config.run), self.progress.wall_seconds):
             return True
         return self.progress.step >= self.budget and not self.ensemble.behind
 

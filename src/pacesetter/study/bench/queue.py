@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from pacesetter import storage
+from pacesetter.budget import is_spent
 from pacesetter.ensemble.progress import Progress
 from pacesetter.errors import UsageError
 from pacesetter.runs import IN_USE
@@ -47,19 +48,6 @@ class Executor(Protocol):
         ...
 
 
-def refuse_others(job: Job) -> None:
-    """Refuse a run that is in the job's folder with other settings."""
-    if not job.directory.config_file.exists():
-        return
-    old, new = job.directory.config().settings(), job.config.settings()
-    for key in new:
-        if old.get(key) != new[key]:
-            raise UsageError(
-                f"run: {job.directory.path} exists with {key}={old.get(key)}, not {new[key]}; "
-                "give other --runs, or the entry another name"
-            )
-
-
 def is_finished(job: Job) -> bool:
     """Whether the newest checkpoint has spent the job's budget and been evaluated there."""
     try:
@@ -67,10 +55,8 @@ def is_finished(job: Job) -> bool:
         progress = Progress.load(table["progress"])
     except (UsageError, *storage.FAULTS):
         return False  # nothing yet, or damaged, which `resume` deals with
-    run = job.config.run
-    spent = progress.step >= run.steps * job.config.steps_per_count
-    late = run.time is not None and progress.wall_seconds >= run.time
-    return (spent or late) and progress.last_evaluation == progress.step
+    spent = is_spent(vars(job.config.run), progress.step, progress.wall_seconds)
+    return spent and progress.last_evaluation == progress.step
 
 
 def words_of(job: Job) -> list[str]:
@@ -85,7 +71,11 @@ class Bench:
 
     def __init__(self, jobs: list[Job]) -> None:
         for job in jobs:
-            refuse_others(job)
+            if found := job.directory.difference_from(job.config):
+                raise UsageError(
+                    f"run: {job.directory.path} exists with {found}; "
+                    "give other --runs, or the entry another name"
+                )
         self.jobs = jobs
         done = [is_finished(job) for job in jobs]
         self.finished = [job for job, over in zip(jobs, done, strict=True) if over]

@@ -10,6 +10,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.settings import Settings, Tune
+from pacesetter.validation import difference, fields_of
 
 try:
     import optuna
@@ -24,7 +25,7 @@ def ranges(hyper: type, fixed: Settings) -> Ranges:
     """What is searched: the settings that declare a range and are not fixed."""
     return {
         name: mark
-        for name, info in vars(hyper)["__pydantic_fields__"].items()
+        for name, info in fields_of(hyper).items()
         for mark in info.metadata
         if isinstance(mark, Tune) and name not in fixed
     }
@@ -61,11 +62,8 @@ def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) 
         usual = {name: settings[name] for name in searched}
         study.enqueue_trial({k: v for k, v in usual.items() if searched[k].has(v)})
         return study
-    for key in {**old, **new}:
-        if old.get(key) != new.get(key):
-            raise UsageError(
-                f"study: {file} has {key}={old.get(key)}, not {new.get(key)}; give another --study"
-            )
+    if found := difference(old, new, {**old, **new}):
+        raise UsageError(f"study: {file} has {found}; give another --study")
     return study
 
 
