@@ -1,4 +1,4 @@
-"""What `list` and `show` print, as lines."""
+"""The verbs `list` and `show`: what there is, as lines."""
 
 import inspect
 from typing import Any
@@ -6,10 +6,36 @@ from typing import Any
 from tabulate import tabulate
 
 from pacesetter.budget import budget, is_spent
-from pacesetter.errors import UsageError
-from pacesetter.runs import RunDirectory, find_all
+from pacesetter.cli.flags import add_runs, parser
+from pacesetter.errors import UsageError, unknown
+from pacesetter.runs import Row, RunDirectory, find, find_all
 
 SHOWN_EVALUATIONS = 5
+
+
+def list_(words: list[str]) -> int:
+    """List algorithms, envs, rules, presets, suites or runs."""
+    command = parser("list", "List algorithms, envs, rules, presets, suites or runs.")
+    nouns = [*LISTS, "runs"]
+    command.add_argument("noun", metavar="|".join(nouns), help="what to list")
+    add_runs(command)
+    found = command.parse(words)
+    if found.noun not in nouns:
+        raise unknown("list", found.noun, nouns)
+    for line in runs(found.runs) if found.noun == "runs" else LISTS[found.noun]():
+        print(line)
+    return 0
+
+
+def show(words: list[str]) -> int:
+    """Show a run: how far it is, how it scores, what it spent, its settings."""
+    command = parser("show", "Show a run: how far it is, how it scores, what it spent.")
+    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
+    add_runs(command)
+    found = command.parse(words)
+    for line in describe(find(found.run, found.runs)):
+        print(line)
+    return 0
 
 
 def algorithms() -> list[str]:
@@ -24,7 +50,7 @@ def algorithms() -> list[str]:
 
 
 def envs() -> list[str]:
-    """The walkers by id, and what else `train` takes."""
+    """Gymnasium's walkers by id, and what else `train` takes."""
     from pacesetter.envs import known
 
     walkers = ("HalfCheetah", "Walker2d", "Ant", "Humanoid", "Hopper", "Swimmer")
@@ -49,15 +75,24 @@ def presets() -> list[str]:
 
 
 def suites() -> list[str]:
-    """What `bench` ships, how many runs each is, and what it is for."""
+    """Suites that come with the package: how many runs each has, and what it is for."""
     from pacesetter.study.bench.suite import count, load, shipped
 
     found = [load(name) for name in shipped()]
     return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
 
 
+LISTS = {
+    "algorithms": algorithms,
+    "envs": envs,
+    "rules": rules,
+    "presets": presets,
+    "suites": suites,
+}
+
+
 def runs(folder: str) -> list[str]:
-    """Runs below a folder: how far each is and how its champion does."""
+    """Runs below a folder: how far each is and how its champion scores."""
     rows: list[tuple[Any, ...]] = []
     for run in find_all(folder):
         try:
@@ -78,35 +113,36 @@ def describe(run: RunDirectory) -> list[str]:
 
 
 def _describe(run: RunDirectory) -> list[str]:
-    record = run.record()
+    record, rows = run.record(), run.rows()
     steps, state, _ = _state(run)
-    rows = run.rows()
     evaluations = [row for row in rows if row["kind"] == "eval"]
-    selections = [row for row in rows if row["kind"] == "select"]
     recent = [
         (f"{row['step']:,}", f"{row['mean']:.1f}", f"{row['std']:.1f}", len(row["returns"]))
         for row in evaluations[-SHOWN_EVALUATIONS:]
     ]
-    last = rows[-1] if rows else {}
-    ledger = [
-        (key, last[key])
-        for key in ("member_steps", "selection_steps", "updates", "transitions", "episodes")
-        if key in last
-    ]
-    times = [(key, f"{last[key]:.0f}") for key in ("cpu_seconds", "wall_seconds") if key in last]
-    settings = [(key, value) for key, value in record["settings"].items()]
     made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
-    made += [(name, number) for name, number in record["versions"].items()]
     return [
         f"{run.path}: {steps} steps, {state}",
         "",
         *_table(recent, ("step", "return", "std", "episodes")),
         "",
-        *_table([*ledger, ("selections", len(selections)), *times]),
+        *_table(_ledger(rows)),
         "",
-        *_table(settings),
+        *_table(list(record["settings"].items())),
         "",
-        *_table(made),
+        *_table([*made, *record["versions"].items()]),
+    ]
+
+
+def _ledger(rows: list[Row]) -> list[tuple[str, Any]]:
+    """What a run has spent, by the last row of its log."""
+    last = rows[-1] if rows else {}
+    counts = ("member_steps", "selection_steps", "updates", "transitions", "episodes")
+    times = ("cpu_seconds", "wall_seconds")
+    return [
+        *((key, last[key]) for key in counts if key in last),
+        ("selections", sum(row["kind"] == "select" for row in rows)),
+        *((key, f"{last[key]:.0f}") for key in times if key in last),
     ]
 
 

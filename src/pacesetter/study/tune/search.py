@@ -7,6 +7,8 @@ looks next and goes on from its checkpoint, so no heartbeat is needed.
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,6 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.cli.progress import Sink, console
 from pacesetter.config import resolve
 from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
@@ -32,12 +33,15 @@ from pacesetter.study.tune.journal import (
     ranges,
     refuse_foreign,
 )
-from pacesetter.training.trainer import Trainer
+from pacesetter.training.trainer import Report, Trainer
 
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
 PRUNED, FAILED = optuna.trial.TrialState.PRUNED, optuna.trial.TrialState.FAIL
 SAID = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
 LAST = 3  # evaluations that make a score, or a tenth of all
+
+Sink = Callable[[Report], None]
+Show = Callable[[Trainer], AbstractContextManager[Sink]]  # opens what shows a trial's reports
 
 
 class Tuning:
@@ -91,12 +95,12 @@ class Tuning:
         trials = self.study.get_trials(deepcopy=False)
         return sum(trial.state.is_finished() for trial in trials) >= self.trials
 
-    def run(self, quiet: bool = False) -> None:
-        """Make trials until all have ended or other workers are at them."""
+    def run(self, show: Show) -> None:
+        """Make trials until all have ended or other workers have them; `show` shows each one."""
         while not self._stopping and (claim := self._claim()):
             trial, lock = claim
             with lock:
-                self._try(trial, quiet)
+                self._try(trial, show)
             jax.clear_caches()  # each trial compiles programs of its own
 
     def summary(self) -> str:
@@ -127,11 +131,11 @@ class Tuning:
             assert lock is not None
             return trial, lock
 
-    def _try(self, trial: optuna.Trial, quiet: bool) -> None:
+    def _try(self, trial: optuna.Trial, show: Show) -> None:
         """Train one to its end, its pruning, a fault, or `stop`, which leaves it open."""
         try:
             self._trainer = trainer = self._trainer_of(trial)
-            with console(trainer, quiet) as sink:
+            with show(trainer) as sink:
                 pruned = self._train(trial, trainer, sink)
         except (TrainingError, UsageError) as error:
             self._tell(trial, FAILED, None, str(error))
