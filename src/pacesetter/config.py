@@ -1,4 +1,4 @@
-"""What to train and how: settings merged from many places and checked once."""
+"""The settings of a run: merged from defaults, presets, files and flags, and checked once."""
 
 import json
 import tomllib
@@ -34,56 +34,68 @@ def _check_json(value: dict[str, Any]) -> dict[str, Any]:
 
 def _check_selects_on_eval(value: int, info: ValidationInfo) -> int:
     if value != SELECT_EVERY and info.data.get("select_on") == "train":
-        raise ValueError("is a setting of --select-on eval, not of train")
+        raise ValueError("applies to --select-on eval, not to train")
     return value
 
 
-SELECT_EVERY = 5_000  # steps
+SELECT_EVERY = 5_000  # env steps
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Run:
-    """What to train: the task, the budget, the members and how the best one is chosen."""
+    """What to train: the task, the budget, the members, and how the best member is selected."""
 
-    algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
+    algorithm: str = Field(description="algorithm; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
     env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
-        default_factory=dict, description="given to gymnasium.make"
+        default_factory=dict, description="keywords for gymnasium.make"
     )
-    name: str = Field(pattern=r"^\w[\w.-]*$", description="folder of the run below its env")
-    steps: Count = Field(1_000_000, ge=1, description="env steps of all members together")
-    time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="every random stream follows from it")
-    members: int = Field(1, ge=1, le=1000, description="learners that share the replay")
+    name: str = Field(pattern=r"^\w[\w.-]*$", description="name of the run's folder, below its env")
+    steps: Count = Field(1_000_000, ge=1, description="budget of env steps, all members together")
+    time: Duration | None = Field(
+        None, gt=0, description="stop after this wall time, such as 2h; default no limit"
+    )
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
+    members: int = Field(
+        1, ge=1, le=1000, description="ensemble members: learners that share the replay"
+    )
     rule: Annotated[str, AfterValidator(_check_rule)] = Field(
-        "best", description="who starts again from whom; see `pacesetter list rules`"
+        "best", description="selection rule: who is copied to whom; see `pacesetter list rules`"
     )
     select_on: Literal["train", "eval"] = Field(
-        "train", description="returns of training episodes, or of extra noise-free ones (counted)"
+        "train", description="select by returns of training episodes, or of extra noise-free ones"
     )
     select_every: Annotated[Count, AfterValidator(_check_selects_on_eval)] = Field(
-        SELECT_EVERY, ge=1, description="steps between selections on eval"
+        SELECT_EVERY, ge=1, description="env steps between selections, with --select-on eval"
     )
-    select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
+    select_window: int = Field(1, ge=1, description="episodes per member behind each selection")
     select_after: Count | None = Field(
-        None, ge=0, description="steps before which nothing is selected; none is the warm-up"
+        None, ge=0, description="env steps before the first selection; default --warmup"
     )
-    count_selection_steps: bool = Field(True, description="extra episodes are part of --steps")
+    count_selection_steps: bool = Field(
+        True, description="count the steps of extra selection episodes towards --steps"
+    )
     copy: Literal["full", "weights", "actor"] = Field(
-        "full", description="networks and optimiser, networks single_member, or the actor alone"
+        "full", description="copy networks and optimiser state, only networks, or only the actor"
     )
-    same_init: bool = Field(False, description="members start from the same weights")
+    same_init: bool = Field(False, description="start all members from the same weights")
     count: Literal["all", "member"] = Field(
-        "all", description="`--steps` and clocks count all members' steps, or the mean member's"
+        "all", description="count --steps and intervals over all members, or per member"
     )
-    wait: bool = Field(True, description="a member whose episode ended waits for the others")
+    wait: bool = Field(
+        True, description="a member whose episode has ended waits until all have ended"
+    )
     replay_scope: Literal["shared", "member"] = Field(
-        "shared", description="one replay or one each"
+        "shared", description="one shared replay, or one per member"
     )
-    eval_every: Count = Field(5_000, ge=1, description="steps between evaluations")
-    eval_episodes: int = Field(10, ge=1, description="episodes of an evaluation")
-    checkpoint_every: Duration = Field(60.0, gt=0, description="time between checkpoints")
-    device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
+    eval_every: Count = Field(5_000, ge=1, description="env steps between evaluations")
+    eval_episodes: int = Field(10, ge=1, description="episodes per evaluation")
+    checkpoint_every: Duration = Field(
+        60.0, gt=0, description="time between checkpoints, such as 5m"
+    )
+    device: Literal["auto", "cpu", "gpu", "tpu"] = Field(
+        "auto", description="device that runs the updates"
+    )
 
 
 # Settings of members that share a replay, which a learner on rollouts has not.
@@ -94,7 +106,7 @@ ENSEMBLE_SETTINGS = (
 
 
 class Config(NamedTuple):
-    """A whole run: what to train and with which settings."""
+    """All settings of a run: what to train, and the algorithm's own."""
 
     run: Run
     hyper: Any
@@ -111,7 +123,7 @@ class Config(NamedTuple):
 
     @property
     def select_after(self) -> int:
-        """Steps of all members before which nothing is selected."""
+        """Env steps of all members before the first selection."""
         after = self.run.select_after
         return self.hyper.warmup if after is None else after
 
@@ -126,7 +138,7 @@ def presets() -> dict[str, Settings]:
 
 
 def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
-    """The algorithm behind a name and the settings that its presets lay over the defaults."""
+    """The algorithm behind a name, and its presets' settings in order; later ones win."""
     known = presets()
     if name in known:
         table = dict(known[name])
@@ -147,15 +159,17 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
 
 
 def read_file(path: Path, name: str | None = None) -> Settings:
-    """Settings from a TOML or JSON file, such as a finished run's config.json, which only fits
-    the algorithm, or the name, that it is of."""
+    """Settings from a TOML or JSON file, or from a run's config.json.
+
+    The latter is refused if `name` is neither its algorithm nor its name. Raises UsageError.
+    """
     try:
         text = path.read_text()
         table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"config: cannot read {path}: {error}") from None
     if not isinstance(table, dict):
-        raise UsageError(f"config: {path} holds no table of settings")
+        raise UsageError(f"config: {path} must hold a table of settings")
     found: Any = table.get("settings", table)
     if not isinstance(found, dict):
         raise UsageError(f"config: settings in {path} must be a table")
@@ -169,7 +183,7 @@ def read_file(path: Path, name: str | None = None) -> Settings:
 
 
 def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
-    """Merge defaults, presets and the given layers (later ones win) and check the result once."""
+    """Merge defaults, presets and the given layers, of which later ones win; check them once."""
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper
     merged: Settings = {"name": name.replace(":", "-")}
@@ -191,7 +205,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
         _refuse_ensemble(run)
         rollout = hyper.parallel_envs * hyper.rollout_length
         if run.steps < rollout:
-            raise UsageError(f"steps: {run.steps} are less than one rollout of {rollout}")
+            raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")
     return Config(run, hyper)
 
 
@@ -204,7 +218,7 @@ def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
     if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
         raise UsageError(
             f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
-            "(--update-at episode, --assess) would rarely meet; choose one"
+            "(--update-at episode, --assess) would rarely coincide; choose one"
         )
     if hyper.block > run.steps:
         raise UsageError(
@@ -213,8 +227,8 @@ def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
         )
     if hyper.assess and hyper.warmup_updates:
         raise UsageError(
-            "warmup_updates: --assess waits for episodes of a policy, which the warm-up has "
-            "not; choose one"
+            "warmup_updates: --assess needs episodes of a policy, but the warm-up acts at random; "
+            "choose one"
         )
 
 

@@ -39,8 +39,8 @@ def _parser() -> Parser:
     add("--cpu", metavar="T", help="count each run only up to this CPU time, such as 10m")
     reference = "algorithm that the others are compared with (default td3)"
     add("--reference", default="td3", metavar="NAME", help=reference)
-    add("--published", action="store_true", help="add returns that were published")
-    mixed = "compare runs of unlike env versions, budgets or settings, and say so"
+    add("--published", action="store_true", help="add published returns of other implementations")
+    mixed = "compare different env versions, budgets or settings, and say so"
     add("--mixed", action="store_true", help=mixed)
     add("--smooth", type=int, metavar="N", help="smooth curves over N evaluations")
     add("--no-film", action="store_true", help="leave the video out of the report")

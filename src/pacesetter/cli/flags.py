@@ -57,7 +57,9 @@ def algorithm_and_env(command: Parser, words: list[str]) -> tuple[str, str, list
 
 def add_runs(command: Parser) -> None:
     """`--runs`, the folder of all runs."""
-    command.add_argument("--runs", default="runs", metavar="DIR", help="folder of runs (runs)")
+    command.add_argument(
+        "--runs", default="runs", metavar="DIR", help="folder of runs (default runs)"
+    )
 
 
 def add_quiet(command: Parser) -> None:
