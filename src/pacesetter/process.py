@@ -17,7 +17,7 @@ def cores() -> list[int]:
 def threads() -> int:
     """The size of XLA's thread pool on a CPU: NPROC, by default one thread per core.
 
-    It decides the last bits of results. Raises UsageError if NPROC is no such number.
+    It decides the last bits of results. Raises UsageError if NPROC is anything else.
     """
     text = os.environ.get("NPROC", "").strip()
     if not text:
@@ -37,9 +37,9 @@ def fix_threads(count: int | None = None) -> None:
 
 @contextmanager
 def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
-    """The first signal calls `stop`, which lets all end cleanly; the second ends the process.
+    """Let the first signal call `stop`, for a clean end, and the second end the process.
 
-    Gives the signals received so far.
+    Yields the list of signals received so far.
     """
     received: list[int] = []
 
@@ -59,5 +59,5 @@ def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
 
 
 def exit_code(received: list[int]) -> int:
-    """130 after Ctrl-C, 143 after another request: all is saved, and the command goes on."""
+    """The code of a command that saved and ended on a signal: 130 after Ctrl-C, else 143."""
     return 130 if received[0] == signal.SIGINT else 143

@@ -58,13 +58,13 @@ class _Total:
 
 
 def _lines(bench: Bench) -> Show:
-    steps, said = _Total(bench), time.monotonic()
+    steps, printed_at = _Total(bench), time.monotonic()
 
     def show(bench: Bench) -> None:
-        nonlocal said
-        late = time.monotonic() - said > LINE_EVERY
+        nonlocal printed_at
+        late = time.monotonic() - printed_at > LINE_EVERY
         for line in bench.news or ([""] if late else []):
-            said = time.monotonic()
+            printed_at = time.monotonic()
             done, total, left = steps.read(bench)
             state = f"{len(bench.finished)} of {len(bench.jobs)} runs  "
             state += f"step {done:,} of {total:,}  ETA {left}"
@@ -119,7 +119,7 @@ def _last(directory: RunDirectory) -> tuple[int, str]:
     for line in reversed(lines):
         try:
             row: Row = json.loads(line)
-        except ValueError:  # cut at its beginning
+        except ValueError:  # its beginning is missing
             break
         step = step or row["step"]
         if row["kind"] == "eval":

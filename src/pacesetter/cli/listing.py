@@ -147,7 +147,7 @@ def _ledger(rows: list[Row]) -> list[tuple[str, Any]]:
 
 
 def _state(run: RunDirectory) -> tuple[str, str, str]:
-    """How far a run is, whether it goes on, and its last evaluation."""
+    """How far a run is, its state, and its last evaluation."""
     settings, rows = run.settings(), run.rows()
     last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
     over = is_spent(settings, last["step"], last["wall_seconds"])

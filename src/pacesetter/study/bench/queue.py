@@ -1,7 +1,7 @@
-"""Jobs to their end: each run a command of its own; finished ones are skipped, broken ones resumed.
+"""Run jobs to their end, each as its own command: skip finished ones, resume broken ones.
 
-What has been done is read from the runs' folders alone, so a bench that was stopped or killed is
-called again, and several may work on one folder: the lock of a run's folder decides who has it.
+Progress is read from the runs' folders alone. A bench that was stopped or killed is therefore
+started again, and several may work on one folder: the lock of a run's folder decides who has it.
 """
 
 import shlex
@@ -20,7 +20,7 @@ from pacesetter.study.bench.suite import Job
 RETRIES = 2
 BAD_INPUT, SAVED = 2, (130, 143)  # exit codes of `train` and `resume`
 POLL = 0.2  # seconds
-ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread a run: results never depend on --jobs
+ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread per run: results never depend on --jobs
 
 
 class Outcome(NamedTuple):
@@ -60,7 +60,7 @@ def is_finished(job: Job) -> bool:
 
 
 def words_of(job: Job) -> list[str]:
-    """What brings a run further: `resume` if its folder holds one, else `train`."""
+    """The command that continues a run: `resume` if its folder holds one, else `train`."""
     if job.directory.config_file.exists():
         return ["resume", str(job.directory.path), "-q"]
     return [*job.words, "-q"]
@@ -101,7 +101,7 @@ class Bench:
             make(job.config.run.env, job.config.run.env_kwargs).close()
 
     def run(self, executor: Executor) -> Iterator[None]:
-        """Until all have finished or failed, or have saved after `stop`; yields at every look."""
+        """Run until all have finished, failed or, after `stop`, saved; yields at each poll."""
         stopped = False
         try:
             while self._waiting or self.running:
@@ -167,7 +167,7 @@ class Bench:
         self._waiting.append(job)
         if str(job) not in self._aside:
             self._aside.add(str(job))
-            self.news.append(f"{job}: another process has it; looked at again when it is free")
+            self.news.append(f"{job}: another process has it; will retry when it is free")
 
     def _finish(self, job: Job) -> None:
         self.finished.append(job)

@@ -1,4 +1,4 @@
-"""A run as its results: what is read from a run directory, or from a line of results/*.jsonl."""
+"""Results of one run, read from its folder or from a line of results/*.jsonl."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -26,7 +26,7 @@ AXES = {
 PROVENANCE = ("command", "versions", "commit", "threads", "machine")
 SELECTION = ("step", "gap", "standard_error", "parents", "champion")
 DECIMALS = 3  # of a return in a line of results
-# Numbers of an evaluation's row that are no expense; what else is there, an algorithm counts.
+# Numbers in an evaluation's row that are not spent; the others are counts of an algorithm.
 _NOT_SPENT = {"mean", "std", "champion", "episodes", *COLUMNS}
 
 
@@ -213,7 +213,7 @@ def _directories(word: str, runs: Path) -> list[RunDirectory]:
         below = [run for path in sorted(glob(word)) for run in find_all(path)]
         below += [run for run in find_all(runs) if _fits(run.path, word)]
         if not below:
-            raise UsageError(f"run: '{word}' fits no run here or below {runs}")
+            raise UsageError(f"run: '{word}' matches no run here or below {runs}")
         return below
     groups = [run for run in find_all(runs) if run.path.parent.match(word)]
     return groups or [find(word, runs)]

@@ -1,7 +1,7 @@
 """Search settings with Optuna: a trial is a run, and a study's file is shared by its workers.
 
-A trial belongs to the process that holds its lock. One whose worker died is taken up by whoever
-looks next and goes on from its checkpoint, so no heartbeat is needed.
+A trial belongs to the process that holds its lock. If a worker dies, the next worker to look
+resumes its trial from the checkpoint, so no heartbeat is needed.
 """
 
 import json
@@ -37,8 +37,8 @@ from pacesetter.training.trainer import Report, Trainer
 
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
 PRUNED, FAILED = optuna.trial.TrialState.PRUNED, optuna.trial.TrialState.FAIL
-SAID = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
-LAST = 3  # evaluations that make a score, or a tenth of all
+OUTCOME = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
+FEWEST = 3  # evaluations behind a score, or a tenth of all if that is more
 
 Sink = Callable[[Report], None]
 Show = Callable[[Trainer], AbstractContextManager[Sink]]  # opens what shows a trial's reports
@@ -75,9 +75,9 @@ class Tuning:
             raise UsageError(f"trials: must be at least 1, got {self.trials}")
         for key in ("seed", "name"):
             if key in self.fixed:
-                raise UsageError(f"{key}: trials have their own; seeds start at {TUNING_SEEDS}")
+                raise UsageError(f"{key}: each trial sets its own; seeds start at {TUNING_SEEDS}")
         if not self.ranges:
-            raise UsageError("tune: no setting is left to search; each is given or has no range")
+            raise UsageError("tune: no setting is left to search; all are fixed or have no range")
         if not self.file.name or self.file.is_dir():
             raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
         refuse_foreign(self.file)
@@ -132,7 +132,7 @@ class Tuning:
             return trial, lock
 
     def _try(self, trial: optuna.Trial, show: Show) -> None:
-        """Train one to its end, its pruning, a fault, or `stop`, which leaves it open."""
+        """Train one trial until it ends, is pruned or fails; `stop` leaves it open."""
         try:
             self._trainer = trainer = self._trainer_of(trial)
             with show(trainer) as sink:
@@ -186,7 +186,7 @@ class Tuning:
                 text = f"{text}, best {best.value:.1f} in trial {best.number}"
                 write_atomically(self.best_file, self._best_toml(best).encode())
         print(
-            f"trial {trial.number} of {self.trials}: {SAID[state]} {text}",
+            f"trial {trial.number} of {self.trials}: {OUTCOME[state]} {text}",
             file=sys.stderr,
             flush=True,
         )
@@ -205,9 +205,9 @@ class Tuning:
 
 
 def _score(rows: list[Row]) -> float:
-    """Mean return of the last evaluations, a tenth of them or LAST; that of step 0 never counts."""
+    """Mean return of the last evaluations, a tenth of all or FEWEST; step 0 never counts."""
     means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
-    return float(np.mean(means[-max(LAST, len(means) // 10) :]))
+    return float(np.mean(means[-max(FEWEST, len(means) // 10) :]))
 
 
 def _toml(value: Any) -> str:
