@@ -24,7 +24,7 @@ import numpy as np
 
 from pacesetter import algorithms
 from pacesetter.batch import Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.learner.compiled import Population
 from pacesetter.replay.buffer import Columns
 
@@ -91,7 +91,7 @@ def whole(
     name: str, spec: Spec, members: int, **settings: Any
 ) -> tuple[Callable[[], Any], Counter[Product], int]:
     """A cycle of every member as training calls it, its products, and its updates."""
-    config = settle(name, "HalfCheetah-v5", settings)
+    config = resolve(name, "HalfCheetah-v5", settings)
     algorithm = algorithms.find(config.run.algorithm).build(spec, config.hyper)
     columns = Columns(*spec, len(algorithm.mask(np.random.default_rng(0))))
     hyper = config.hyper

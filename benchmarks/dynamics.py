@@ -21,7 +21,7 @@ from tabulate import tabulate
 
 from pacesetter import policy
 from pacesetter.batch import Batch, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.dynamics import fit as fitting
 from pacesetter.dynamics.model import Dynamics, Models
 from pacesetter.envs import Environment
@@ -32,7 +32,7 @@ from pacesetter.types import Floats
 TARGET = 0.1
 HELD = 5  # steps that a random action is held
 NOISE = (0.0, 0.1, 0.5)  # deviations of noise on a policy's actions
-STEVE: Any = settle("steve", "HalfCheetah-v5").hyper
+STEVE: Any = resolve("steve", "HalfCheetah-v5").hyper
 
 
 def episode(env: Environment, kind: int, policies: list[Policy], rng: Any) -> list[list[Any]]:

@@ -36,7 +36,7 @@ from scipy.stats import gmean
 from tabulate import tabulate
 
 from pacesetter import algorithms
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.learner.backend import compiler_options
 from pacesetter.learner.precision import SMALL
 from pacesetter.replay.buffer import Columns
@@ -213,7 +213,7 @@ def aligned(values: Any, dtype: Any) -> Any:
 
 def update_products(name: str, batch: int) -> Counter[Product]:
     """The matrix products of a cycle of updates; those of vectors, a thousandth, are left out."""
-    config = settle(name, "HalfCheetah-v5", {"batch_size": batch})
+    config = resolve(name, "HalfCheetah-v5", {"batch_size": batch})
     spec = SPECS["HalfCheetah-v5"]
     learner = algorithms.find(config.run.algorithm).build(spec, config.hyper)
     columns = Columns(*spec, len(learner.mask(np.random.default_rng(0))))

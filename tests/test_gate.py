@@ -10,7 +10,7 @@ import pytest
 
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.learner.backend import IN_PLACE, compiler_options, prepare
 from pacesetter.learner.compiled import Population
 from pacesetter.training.trainer import Trainer
@@ -25,7 +25,7 @@ CALLS = 100  # Python calls a step of one td3 member; it was 97
 
 def costs(name: str) -> dict[str, float]:
     """XLA's own count for one compiled cycle, by update."""
-    config = settle(name, "HalfCheetah-v5")
+    config = resolve(name, "HalfCheetah-v5")
     algorithm = algorithms.find(name).build(HALF_CHEETAH, config.hyper)
     layout = Layout(HALF_CHEETAH)
     population = Population(algorithm, layout, 0, normalize=False)

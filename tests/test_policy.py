@@ -60,7 +60,7 @@ def make_policy(
 SCRIPT = """
 import json, sys
 import pacesetter
-from pacesetter.cli import main
+from pacesetter.cli.main import main
 policy = pacesetter.load(sys.argv[1])
 result = pacesetter.evaluate(policy, episodes=2, seed=4)
 assert main(["eval", sys.argv[1], "--episodes", "2", "--seed", "4", "--json"]) == 0

@@ -1,30 +1,30 @@
-"""What to train and how: settings merged from many places and checked once."""
+"""The settings of a run: merged from defaults, presets, files and flags, and checked once."""
 
 import json
-import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, ValidationError, ValidationInfo
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from pacesetter import algorithms
+from pacesetter import algorithms, budget
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import ROWS_A_TICK, STRICT, Count, Duration, OffPolicy, OnPolicy, Settings
+from pacesetter.validation import build, fields_of
 
 
-def _rule(value: str) -> str:
+def _check_rule(value: str) -> str:
     if value not in RULES:
         raise unknown("rule", value, RULES)
     return value
 
 
-def _plain(value: dict[str, Any]) -> dict[str, Any]:
+def _check_json(value: dict[str, Any]) -> dict[str, Any]:
     try:
         json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
@@ -32,85 +32,103 @@ def _plain(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _of_trials(value: int, info: ValidationInfo) -> int:
+def _check_selects_on_eval(value: int, info: ValidationInfo) -> int:
     if value != SELECT_EVERY and info.data.get("select_on") == "train":
-        raise ValueError("is a setting of --select-on eval, not of train")
+        raise ValueError("applies to --select-on eval, not to train")
     return value
 
 
-SELECT_EVERY = 5_000  # steps
+SELECT_EVERY = 5_000  # env steps
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Run:
-    """What to train: the task, the budget, the members and how the best one is chosen."""
+    """What to train: the task, the budget, the members, and how the best member is selected."""
 
-    algorithm: str = Field(description="the learner; see `pacesetter list algorithms`")
+    algorithm: str = Field(description="algorithm; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
-    env_kwargs: Annotated[dict[str, Any], AfterValidator(_plain)] = Field(
-        default_factory=dict, description="given to gymnasium.make"
+    env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
+        default_factory=dict, description="keywords for gymnasium.make"
     )
-    name: str = Field(pattern=r"^\w[\w.-]*$", description="folder of the run below its env")
-    steps: Count = Field(1_000_000, ge=1, description="env steps of all members together")
-    time: Duration | None = Field(None, gt=0, description="stop after this much time, such as 2h")
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="every random stream follows from it")
-    members: int = Field(1, ge=1, le=1000, description="learners that share the replay")
-    rule: Annotated[str, AfterValidator(_rule)] = Field(
-        "best", description="who starts again from whom; see `pacesetter list rules`"
+    name: str = Field(pattern=r"^\w[\w.-]*$", description="name of the run's folder, below its env")
+    steps: Count = Field(1_000_000, ge=1, description="budget of env steps, all members together")
+    time: Duration | None = Field(
+        None, gt=0, description="stop after this wall time, such as 2h; default no limit"
+    )
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
+    members: int = Field(
+        1, ge=1, le=1000, description="ensemble members: learners that share the replay"
+    )
+    rule: Annotated[str, AfterValidator(_check_rule)] = Field(
+        "best", description="selection rule: who is copied to whom; see `pacesetter list rules`"
     )
     select_on: Literal["train", "eval"] = Field(
-        "train", description="returns of training episodes, or of extra noise-free ones (counted)"
+        "train", description="select by returns of training episodes, or of extra noise-free ones"
     )
-    select_every: Annotated[Count, AfterValidator(_of_trials)] = Field(
-        SELECT_EVERY, ge=1, description="steps between selections on eval"
+    select_every: Annotated[Count, AfterValidator(_check_selects_on_eval)] = Field(
+        SELECT_EVERY, ge=1, description="env steps between selections, with --select-on eval"
     )
-    select_window: int = Field(1, ge=1, description="episodes a member that decide a selection")
+    select_window: int = Field(1, ge=1, description="episodes per member behind each selection")
     select_after: Count | None = Field(
-        None, ge=0, description="steps before which nothing is selected; none is the warm-up"
+        None, ge=0, description="env steps before the first selection; default --warmup"
     )
-    count_selection_steps: bool = Field(True, description="extra episodes are part of --steps")
+    count_selection_steps: bool = Field(
+        True, description="count the steps of extra selection episodes towards --steps"
+    )
     copy: Literal["full", "weights", "actor"] = Field(
-        "full", description="networks and optimiser, networks single_member, or the actor alone"
+        "full", description="copy networks and optimiser state, only networks, or only the actor"
     )
-    same_init: bool = Field(False, description="members start from the same weights")
+    same_init: bool = Field(False, description="start all members from the same weights")
     count: Literal["all", "member"] = Field(
-        "all", description="`--steps` and clocks count all members' steps, or the mean member's"
+        "all", description="count --steps and intervals over all members, or per member"
     )
-    wait: bool = Field(True, description="a member whose episode ended waits for the others")
+    wait: bool = Field(
+        True, description="a member whose episode has ended waits until all have ended"
+    )
     replay_scope: Literal["shared", "member"] = Field(
-        "shared", description="one replay or one each"
+        "shared", description="one shared replay, or one per member"
     )
-    eval_every: Count = Field(5_000, ge=1, description="steps between evaluations")
-    eval_episodes: int = Field(10, ge=1, description="episodes of an evaluation")
-    checkpoint_every: Duration = Field(60.0, gt=0, description="time between checkpoints")
-    device: Literal["auto", "cpu", "gpu", "tpu"] = Field("auto", description="where updates run")
+    eval_every: Count = Field(5_000, ge=1, description="env steps between evaluations")
+    eval_episodes: int = Field(10, ge=1, description="episodes per evaluation")
+    checkpoint_every: Duration = Field(
+        60.0, gt=0, description="time between checkpoints, such as 5m"
+    )
+    device: Literal["auto", "cpu", "gpu", "tpu"] = Field(
+        "auto", description="device that runs the updates"
+    )
 
 
-# What only members that share a replay need.
-SELECTION = ("select_on", "select_every", "select_window", "select_after", "count_selection_steps")
-OF_MEMBERS = ("members", "rule", *SELECTION, "copy", "same_init")
-OF_ENSEMBLES = (*OF_MEMBERS, "count", "wait", "replay_scope")
+# Settings of members that share a replay, which a learner on rollouts has not.
+ENSEMBLE_SETTINGS = (
+    *("members", "rule", "copy", "same_init", "count", "wait", "replay_scope"),
+    *("select_on", "select_every", "select_window", "select_after", "count_selection_steps"),
+)
 
 
 class Config(NamedTuple):
-    """A whole run: what to train and with which settings."""
+    """All settings of a run: what to train, and the algorithm's own."""
 
     run: Run
     hyper: Any
 
     @property
-    def unit(self) -> int:
-        """Steps of all members that budget and clocks count as one."""
-        return self.run.members if self.run.count == "member" else 1
+    def steps_per_count(self) -> int:
+        """Env steps of all members for each one that `--steps` and the intervals count."""
+        return budget.steps_per_count(vars(self.run))
+
+    @property
+    def budget(self) -> int:
+        """Env steps that all members make together, until the run is over."""
+        return budget.budget(vars(self.run))
 
     @property
     def select_after(self) -> int:
-        """Steps of all members before which nothing is selected."""
+        """Env steps of all members before the first selection."""
         after = self.run.select_after
         return self.hyper.warmup if after is None else after
 
     def settings(self) -> Settings:
-        """All settings as one flat table, which `settle` takes back."""
+        """All settings as one flat table, which `resolve` takes back."""
         return asdict(self.run) | asdict(self.hyper)
 
 
@@ -120,7 +138,7 @@ def presets() -> dict[str, Settings]:
 
 
 def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
-    """The algorithm behind a name and the settings that its presets lay over the defaults."""
+    """The algorithm behind a name, and its presets' settings in order; later ones win."""
     known = presets()
     if name in known:
         table = dict(known[name])
@@ -141,15 +159,17 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
 
 
 def read_file(path: Path, name: str | None = None) -> Settings:
-    """Settings from a TOML or JSON file, such as a finished run's config.json, which only fits
-    the algorithm, or the name, that it is of."""
+    """Settings from a TOML or JSON file, or from a run's config.json.
+
+    The latter is refused if `name` is neither its algorithm nor its name. Raises UsageError.
+    """
     try:
         text = path.read_text()
         table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"config: cannot read {path}: {error}") from None
     if not isinstance(table, dict):
-        raise UsageError(f"config: {path} holds no table of settings")
+        raise UsageError(f"config: {path} must hold a table of settings")
     found: Any = table.get("settings", table)
     if not isinstance(found, dict):
         raise UsageError(f"config: settings in {path} must be a table")
@@ -162,15 +182,15 @@ def read_file(path: Path, name: str | None = None) -> Settings:
     return {key.replace("-", "_"): value for key, value in found.items()}
 
 
-def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
-    """Merge defaults, presets and the given layers (later ones win) and check the result once."""
+def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
+    """Merge defaults, presets and the given layers, of which later ones win; check them once."""
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper
     merged: Settings = {"name": name.replace(":", "-")}
     for layer in (*below, *layers):
         merged |= layer
     merged |= {"algorithm": base, "env": env}
-    run_names, hyper_names = names_of(Run), names_of(hyper_type)
+    run_names, hyper_names = fields_of(Run).keys(), fields_of(hyper_type).keys()
     for key in merged:
         if key not in run_names | hyper_names:
             help_of = f"pacesetter train {name} {env} --help"
@@ -178,18 +198,18 @@ def settle(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     run = build(Run, {key: value for key, value in merged.items() if key in run_names})
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
     if isinstance(hyper, OffPolicy):
-        _refuse_what_never_meets(run, hyper)
+        _refuse_conflicts(run, hyper)
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
     if isinstance(hyper, OnPolicy):
         _refuse_ensemble(run)
         rollout = hyper.parallel_envs * hyper.rollout_length
         if run.steps < rollout:
-            raise UsageError(f"steps: {run.steps} are less than one rollout of {rollout}")
+            raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")
     return Config(run, hyper)
 
 
-def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
+def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
     if hyper.n_step * run.members > ROWS_A_TICK:
         raise UsageError(
             f"n_step: {hyper.n_step} with {run.members} members; "
@@ -198,7 +218,7 @@ def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
     if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
         raise UsageError(
             f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
-            "(--update-at episode, --assess) would rarely meet; choose one"
+            "(--update-at episode, --assess) would rarely coincide; choose one"
         )
     if hyper.block > run.steps:
         raise UsageError(
@@ -207,45 +227,16 @@ def _refuse_what_never_meets(run: Run, hyper: OffPolicy) -> None:
         )
     if hyper.assess and hyper.warmup_updates:
         raise UsageError(
-            "warmup_updates: --assess waits for episodes of a policy, which the warm-up has "
-            "not; choose one"
+            "warmup_updates: --assess needs episodes of a policy, but the warm-up acts at random; "
+            "choose one"
         )
 
 
 def _refuse_ensemble(run: Run) -> None:
-    for field in fields(Run):
-        value = getattr(run, field.name)
-        if field.name in OF_ENSEMBLES and value != (default := _default(field.name)):
+    for name in ENSEMBLE_SETTINGS:
+        value, default = getattr(run, name), fields_of(Run)[name].default
+        if value != default:
             raise UsageError(
-                f"{field.name}: {run.algorithm} trains one member, on rollouts of its own; "
+                f"{name}: {run.algorithm} trains one member, on its own rollouts; "
                 f"must stay {default}, got {value}"
             )
-
-
-def _default(name: str) -> Any:
-    infos: dict[str, Any] = Run.__dict__["__pydantic_fields__"]
-    return infos[name].default
-
-
-def names_of(kind: type) -> set[str]:
-    """Field names of a settings class."""
-    return {field.name for field in fields(kind)}
-
-
-def build(kind: type, table: Settings) -> Any:
-    """Make checked settings, or refuse them in one line that names the field."""
-    infos: dict[str, Any] = kind.__dict__["__pydantic_fields__"]
-    for key, value in table.items():  # Python, and so pydantic, takes True for 1
-        annotation = infos[key].annotation
-        if isinstance(value, bool) and {int, float} & {annotation, *get_args(annotation)}:
-            raise UsageError(f"{key}: should be a number, got {str(value).lower()}")
-    try:
-        return kind(**table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"][:1])
-        if first["type"] == "literal_error":
-            options = re.findall(r"'([^']*)'", first.get("ctx", {})["expected"])
-            raise unknown(field, str(first["input"]), options) from None
-        message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-        raise UsageError(f"{field}: {message}, got {first['input']!r}") from None

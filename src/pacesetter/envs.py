@@ -1,4 +1,4 @@
-"""The env border: Gymnasium tasks in float32 and [-1, 1], checked, and entered again where left."""
+"""Gymnasium tasks in float32 with actions in [-1, 1]: checked, seeded, and resumed exactly."""
 
 import difflib
 import logging
@@ -16,8 +16,8 @@ from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.types import Floats
 
-LONGEST = 100_000  # steps of an episode; one that never ends would hang every evaluation
-LARGEST = float(np.finfo(np.float32).max)  # of a reward, which the replay keeps in float32
+MAX_EPISODE = 100_000  # steps; an episode that never ends would hang every evaluation
+MAX_REWARD = float(np.finfo(np.float32).max)  # the replay keeps rewards in float32
 
 
 class PaddedAnt(gymnasium.ObservationWrapper[Any, Any, Any]):
@@ -66,7 +66,7 @@ class Snapshot(NamedTuple):
 
 
 def known() -> list[str]:
-    """Ids that `make` accepts without a module, less those whose entry point only raises."""
+    """Ids that `make` accepts without a module, without those whose entry point only raises."""
 
     def works(entry_point: object) -> bool:
         return not getattr(entry_point, "__name__", "").startswith("_raise_")
@@ -80,7 +80,7 @@ def _log_warning(message: str) -> None:
 
 
 def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """gymnasium.make without the notes that v4 is old and that its models use an old keyword."""
+    """gymnasium.make without the warnings that v4 is old and its models use an old keyword."""
     import mujoco
 
     # Without a handler MuJoCo writes MUJOCO_LOG.TXT into the working directory.
@@ -91,7 +91,7 @@ def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
 
 
 def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
-    """A task by its Gymnasium id, or one line that says what is wrong with the id or the task."""
+    """Make a task by its Gymnasium id. Raises UsageError if the id or the task is wrong."""
     plain = name.split(":")[-1]
     if not re.search(r"-v\d+$", plain, re.IGNORECASE) and name not in known():
         versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
@@ -108,11 +108,11 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
         _check_space(f"env: {name}: {what} space", getattr(env, f"{what}_space", None))
     if not np.issubdtype(env.action_space.dtype, np.floating):
         raise UsageError(
-            f"env: {name}: action space: must be of float32 or float64, it is {env.action_space}"
+            f"env: {name}: action space: must be of float32 or float64, got {env.action_space}"
         )
     if not np.isfinite(np.concatenate(_bounds(env))).all():
         raise UsageError(
-            f"env: {name}: action space: its bounds must be finite, it is {env.action_space}"
+            f"env: {name}: action space: its bounds must be finite, got {env.action_space}"
         )
     return env
 
@@ -124,7 +124,7 @@ def _near(name: str) -> list[str]:
 def _check_space(what: str, space: Any) -> None:
     if not isinstance(space, Box):
         hint = " (wrap it in FlattenObservation)" if "observation" in what else ""
-        raise UsageError(f"{what}: must be a Box, it is {type(space).__name__}{hint}")
+        raise UsageError(f"{what}: must be a Box, got {type(space).__name__}{hint}")
     if 0 in space.shape:
         raise UsageError(f"{what}: must hold at least one number, its shape is {space.shape}")
 
@@ -140,10 +140,10 @@ def _bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:
 
 
 class Environment:
-    """One env and the episode it is in.
+    """One env and its running episode.
 
-    Every episode's reset is seeded by its number, so an episode is found again by its number and
-    its actions, without knowing the simulator.
+    Each reset is seeded by the episode's number. An episode is therefore restored by its number and
+    its actions, whatever the simulator is.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class Environment:
         self.observation = np.zeros(self.observation_size, np.float32)
 
     def reset(self, episode: int | None = None) -> Floats:
-        """Enter an episode by its number, by default the next one."""
+        """Start an episode by its number, by default the next one."""
         self.episode = self.episode + 1 if episode is None else episode
         self.actions, self.earned = [], 0.0
         seed = episode_seed(self.seed, self.stream, self.index, self.episode)
@@ -177,8 +177,8 @@ class Environment:
 
     def step(self, action: Floats) -> Step:
         """One step with an action (A,) in [-1, 1]."""
-        if len(self.actions) >= LONGEST:
-            why = f"has not ended after {LONGEST:,} steps; give the task a limit, such as"
+        if len(self.actions) >= MAX_EPISODE:
+            why = f"has not ended after {MAX_EPISODE:,} steps; give the task a limit, such as"
             raise self._broken("episode", f"{why} --env.max_episode_steps 1000")
         self.actions.append(action)
         scaled = to_env(action, self.low, self.high)
@@ -190,14 +190,14 @@ class Environment:
             )
         observation, reward, terminated, truncated, info = result
         if np.ndim(reward) != 0 or not isinstance(reward, (int, float, np.number)):
-            raise self._broken("reward", f"must be one number, it is {reward!r}")
-        if not abs(reward) <= LARGEST:
-            raise self._broken("reward", f"must be finite in float32, it is {reward}")
+            raise self._broken("reward", f"must be one number, got {reward!r}")
+        if not abs(reward) <= MAX_REWARD:
+            raise self._broken("reward", f"must be finite in float32, got {reward}")
         for what, flag in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(flag, (bool, np.bool_)):
-                raise self._broken(what, f"must be a bool, it is {flag!r}")
+                raise self._broken(what, f"must be a bool, got {flag!r}")
         if not isinstance(info, dict):
-            raise self._broken("info", f"must be a dict, it is {info!r}")
+            raise self._broken("info", f"must be a dict, got {info!r}")
         self.observation = self._observation(observation)
         self.earned += float(reward)
         return Step(self.observation, float(reward), bool(terminated), bool(truncated), info)
@@ -214,7 +214,7 @@ class Environment:
         self.episode = -1
 
     def _check_given(self) -> None:
-        """Refuse an observation that is not of its own space."""
+        """Refuse an observation outside the env's own observation space."""
         space: Any = self.env.observation_space
         given = self.given
         if not isinstance(given, (np.ndarray, np.generic)):
@@ -222,7 +222,7 @@ class Environment:
             raise self._broken("observation", f"must be a NumPy array, it is a {kind}")
         if not np.can_cast(given.dtype, space.dtype):
             raise self._broken(
-                "observation", f"must be {space.dtype} as its space is, it is {given.dtype}"
+                "observation", f"must be {space.dtype} as its space is, got {given.dtype}"
             )
         outside = np.flatnonzero((given < space.low) | (given > space.high))
         if outside.size:
@@ -239,7 +239,7 @@ class Environment:
         return Snapshot(self.episode, actions, self.observation)
 
     def restore(self, snapshot: Snapshot) -> bool:
-        """Enter the snapshot's episode again; False if the env does not repeat it exactly."""
+        """Replay the snapshot's episode; False if the env does not repeat it exactly."""
         self.reset(snapshot.episode)
         for action in snapshot.actions:
             if self.step(action).ended:
@@ -261,7 +261,7 @@ class Environment:
         try:
             flat = np.array(observation, np.float32).ravel()
         except (TypeError, ValueError):
-            raise self._broken("observation", f"must be numbers, it is {observation!r}") from None
+            raise self._broken("observation", f"must be numbers, got {observation!r}") from None
         if np.shape(observation) != self.observation_shape:
             shape = np.shape(observation)
             raise self._broken(

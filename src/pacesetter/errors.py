@@ -1,16 +1,16 @@
-"""What can go wrong, said to people in one line: the field, the fault, what is allowed."""
+"""Errors for people, in one line: the field, what is wrong, what is allowed."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
-LONGEST = 500
+MAX_LENGTH = 500  # characters
 
 
 class _OneLine(Exception):  # noqa: N818
     def __init__(self, message: str) -> None:
         text = " ".join(message.split())
-        super().__init__(text if len(text) <= LONGEST else f"{text[:LONGEST]}...")
+        super().__init__(text if len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}...")
 
 
 class UsageError(_OneLine):
@@ -18,13 +18,13 @@ class UsageError(_OneLine):
 
 
 class TrainingError(_OneLine):
-    """A run that cannot go on, such as one with a NaN; its last good checkpoint is kept."""
+    """A run that cannot continue, such as one with a NaN; its last good checkpoint is kept."""
 
 
 def unknown(
     kind: str, word: str, options: Iterable[str], see: str = "pacesetter list"
 ) -> UsageError:
-    """Refuse an unknown name, with the nearest ones that exist."""
+    """Refuse an unknown name and offer the nearest ones that exist."""
     options = sorted(options)
     near = get_close_matches(word, options, n=3, cutoff=0.6)
     if near:
@@ -37,7 +37,7 @@ def unknown(
 
 
 class blame:  # noqa: N801 (a context manager reads as a verb)
-    """Name member (or env) and step in whatever an env does wrong."""
+    """Add the member (or env) and the step to a TrainingError."""
 
     def __init__(self, number: int, step: int, who: str = "member") -> None:
         self.where = f"{who} {number}, step {step}"

@@ -36,7 +36,7 @@ def rollouts(
 ) -> Evaluation:
     """Run episodes `first`, `first + 1`, ... with actions in [-1, 1]; std is over episodes, ddof 0.
 
-    After `limit` steps in all, the rest is cut.
+    Stops after `limit` steps in all, even within an episode.
     """
     returns: list[float] = []
     lengths: list[int] = []
@@ -68,7 +68,8 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on fresh episodes; without one, or if asked to, uniformly random actions.
 
-    The env defaults to the policy's own; `noise` is the deviation of Gaussian noise in [-1, 1].
+    The env defaults to the policy's own; `noise` is the standard deviation of Gaussian noise on
+    actions in [-1, 1]. Raises UsageError.
     """
     if episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
@@ -91,15 +92,13 @@ def enter(
     env_kwargs: dict[str, Any] | None = None,
     **extra: Any,
 ) -> Environment:
-    """The given task or the policy's own, checked against the policy; `extra` goes to its maker."""
+    """Make the given task or the policy's own and check that they fit; `extra` are its keywords."""
     about = policy.about if policy else {}
     name = env or about.get("env")
     if name is not None and not isinstance(name, str):
-        raise UsageError(
-            f"env: must be an id, such as HalfCheetah-v5, it is a {type(name).__name__}"
-        )
+        raise UsageError(f"env: must be an id such as HalfCheetah-v5, got a {type(name).__name__}")
     if name is None:
-        raise UsageError("env: none given and the policy names none")
+        raise UsageError("env: the policy names no env; give one with --env")
     if env is None and ":" in name:
         raise UsageError(
             f"env: the file names '{name}', which imports a module; allow it with --env {name}"

@@ -1,4 +1,4 @@
-"""A trained policy as one small file, and what it does in NumPy alone: no JAX, no training code."""
+"""A trained policy: one small file, and its actions in NumPy without JAX or training code."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ def relu(x: Floats) -> Floats:
 
 
 def clip(x: Floats, low: float = -1.0, high: float = 1.0) -> Floats:
-    """Cut to a range, quicker than np.clip for the few numbers of an action."""
+    """Clip to a range; faster than np.clip for the few numbers of an action."""
     return np.minimum(np.maximum(x, np.float32(low)), np.float32(high))
 
 
@@ -33,7 +33,7 @@ OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": clip}
 
 
 def forward(layers: Layers, x: Floats, activation: Callable[[Floats], Floats] = relu) -> Floats:
-    """The linear output (..., outputs) of one network: what `nets.apply` is in JAX."""
+    """The linear output (..., outputs) of one network, as `mlp.apply` gives it in JAX."""
     for layer in layers[:-1]:
         x = x @ layer["kernel"] + layer["bias"]
         if "scale" in layer:
@@ -45,7 +45,7 @@ def forward(layers: Layers, x: Floats, activation: Callable[[Floats], Floats] = 
 
 
 class Actors(NamedTuple):
-    """What an algorithm gives to be written: layers with a leading axis N of averaged actors."""
+    """An algorithm's part of a policy file: layers with a leading axis N of averaged actors."""
 
     layers: Any
     activation: str
@@ -53,14 +53,14 @@ class Actors(NamedTuple):
 
 
 def to_env(action: Floats, low: Floats, high: Floats) -> Floats:
-    """Clip an action to [-1, 1] and scale it to the env's own bounds; nowhere else is this done."""
+    """Clip an action to [-1, 1] and scale it to the env's own bounds; done nowhere else."""
     share = (clip(action) + np.float32(1)) / np.float32(2)
     scaled = low * (np.float32(1) - share) + high * share
     return np.minimum(np.maximum(scaled, low), high)
 
 
 def normalize(observation: Floats, mean: Floats, deviation: Floats) -> Floats:
-    """Subtract, divide and cut at +-10, as the learners saw it."""
+    """Subtract the mean, divide by the standard deviation and clip at +-10, as in training."""
     scaled = (observation - mean) / deviation
     return np.clip(scaled, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(np.float32)
 
@@ -158,7 +158,7 @@ def load(path: str | Path) -> Policy:
 
 
 def _check(policy: Policy, arrays: storage.Arrays) -> None:
-    """Refuse shapes that do not fit each other, before they are computed with."""
+    """Refuse values that are not finite and shapes that do not fit each other."""
     about: Any = policy.about
     if not isinstance(about, dict):
         raise ValueError("about must be a table")
@@ -187,11 +187,11 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     if sizes != [inputs, len(policy.low)]:
         raise ValueError(f"shapes of {sizes} numbers do not fit its networks")
     if not (policy.low <= policy.high).all():
-        raise ValueError("its bounds are exchanged")
+        raise ValueError("a lower bound exceeds its upper bound")
     if policy.normalizer is not None:
         mean, deviation = policy.normalizer
         if mean.shape != (inputs,) or deviation.shape != (inputs,) or not (deviation > 0).all():
-            raise ValueError("its normaliser does not fit")
+            raise ValueError("its normalization does not fit its networks")
 
 
 def _shapes(table: Any) -> tuple[Shape, Shape] | None:

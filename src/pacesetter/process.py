@@ -1,4 +1,4 @@
-"""What a command settles for its process: the number of threads, and how signals end it."""
+"""A command's process: its cores and threads, and how signals end it."""
 
 import os
 import signal
@@ -6,25 +6,40 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from types import FrameType
 
+from pacesetter.errors import UsageError
 
-def fix_threads(count: int | None = None) -> None:
-    """Fix the size of XLA's thread pool, which decides result bits, before JAX is imported."""
-    if count is not None:
-        os.environ["NPROC"] = str(count)
-    os.environ.setdefault("NPROC", str(len(os.sched_getaffinity(0))))
+
+def cores() -> list[int]:
+    """The cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))
 
 
 def threads() -> int:
-    """How many threads this process may keep busy."""
-    cores = len(os.sched_getaffinity(0))
-    return max(int(os.environ.get("NPROC", cores)), 1)
+    """The size of XLA's thread pool on a CPU: NPROC, by default one thread per core.
+
+    It decides the last bits of results. Raises UsageError if NPROC is anything else.
+    """
+    text = os.environ.get("NPROC", "").strip()
+    if not text:
+        return len(cores())
+    if not (text.isdecimal() and int(text) >= 1):
+        raise UsageError(
+            f"NPROC: must be a whole number of threads, at least 1, got '{text}'; "
+            "unset it for one thread per core"
+        )
+    return int(text)
+
+
+def fix_threads(count: int | None = None) -> None:
+    """Fix the number of threads before JAX is imported, so that XLA takes it too."""
+    os.environ["NPROC"] = str(count or threads())
 
 
 @contextmanager
 def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
-    """The first signal calls `stop`, which lets all end cleanly; the second ends the process.
+    """Let the first signal call `stop`, for a clean end, and the second end the process.
 
-    Gives the signals received so far.
+    Yields the list of signals received so far.
     """
     received: list[int] = []
 
@@ -44,5 +59,5 @@ def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
 
 
 def exit_code(received: list[int]) -> int:
-    """130 after Ctrl-C, 143 after another request: all is saved, and the command goes on."""
+    """The code of a command that saved and ended on a signal: 130 after Ctrl-C, else 143."""
     return 130 if received[0] == signal.SIGINT else 143

@@ -1,30 +1,26 @@
-"""The run directory: what is where, its config, its log, its lock, and how to find one."""
+"""The run directory: its files, its config, its log, its lock, and how to find one."""
 
 import fcntl
 import json
 import os
 import platform
 import re
-import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
-from functools import cache
-from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
-from pacesetter.config import Config, settle
+from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
+from pacesetter.provenance import provenance
 from pacesetter.storage import TEMPORARY, write_atomically
+from pacesetter.validation import difference
 
 SCHEMA = 1
 IN_USE = "is in use by"
-PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 # Settings in which the seeds of one name may differ.
-OF_A_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
+FREE_PER_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
 Row = dict[str, Any]
 
 
@@ -49,37 +45,41 @@ class RunDirectory:
         return cls(Path(runs) / re.sub(r"[/:]", "-", run.env) / run.name / str(run.seed))
 
     def refuse_existing(self, config: Config) -> None:
-        """Refuse to train onto a run that is there, and say how to go on instead."""
-        new = json.loads(json.dumps(config.settings()))
+        """Refuse to train where a run is already, and say what to do instead."""
         if not self.config_file.exists():
-            self._refuse_strangers(new)
+            self._refuse_other_seeds(config)
             return
-        old = self.settings()
-        differing = [key for key in new if old.get(key) != new[key]]
-        if not differing:
-            raise UsageError(f"run: {self.path} exists; go on with `pacesetter resume {self.path}`")
-        key = differing[0]
-        raise UsageError(
-            f"run: {self.path} exists with {key}={old.get(key)}, not {new[key]}; give this one "
-            f"another --name, or go on with `pacesetter resume {self.path}`"
-        )
+        resume = f"continue it with `pacesetter resume {self.path}`"
+        if found := self.difference_from(config):
+            raise UsageError(
+                f"run: {self.path} exists with {found}; give this one another --name, or {resume}"
+            )
+        raise UsageError(f"run: {self.path} exists; {resume}")
 
-    def _refuse_strangers(self, new: Row) -> None:
-        """Refuse to stand beside seeds of the same name that were trained with other settings."""
+    def difference_from(self, config: Config) -> str | None:
+        """The first setting in which the run here differs; None if none does, or no run is here."""
+        if not self.config_file.exists():
+            return None
+        old, new = self.config().settings(), config.settings()
+        return difference(old, new, new)
+
+    def _refuse_other_seeds(self, config: Config) -> None:
+        """Refuse a new seed whose settings differ from those of the other seeds of its name."""
+        new = json.loads(json.dumps(config.settings()))
         for file in sorted(self.path.parent.glob("*/config.json")):
             try:
                 old = RunDirectory(file.parent).settings()
             except UsageError:  # damaged, which is for its own commands to say
                 continue
-            for key in [key for key in new if key in old and key not in OF_A_SEED]:
-                if old[key] != new[key]:
-                    raise UsageError(
-                        f"run: {file.parent} has {key}={old[key]}, not {new[key]}; give runs with "
-                        "other settings another --name"
-                    )
+            # A setting that an older version did not have is not a difference.
+            shared = [key for key in new if key in old and key not in FREE_PER_SEED]
+            if found := difference(old, new, shared):
+                raise UsageError(
+                    f"run: {file.parent} has {found}; give runs with other settings another --name"
+                )
 
     def create(self, config: Config, backend: str | None = None) -> None:
-        """Make the folder and write its config; the only step that starts a run on disk."""
+        """Make the folder and write its config, which starts the run on disk."""
         try:
             places = (self.path, *self.path.parents)
             self._made = [folder for folder in places if not folder.exists()]
@@ -92,7 +92,7 @@ class RunDirectory:
             raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
 
     def note_resume(self, config: Config, step: int, backend: str) -> None:
-        """Add to the config that, and with what, a run was resumed; its budget may be new."""
+        """Note in the config when and with what the run was resumed, and its settings now."""
         table = self.record()
         resumed = [*table.get("resumed", []), {"step": step, **provenance(backend)}]
         self._write_config(table | {"settings": config.settings(), "resumed": resumed})
@@ -133,12 +133,12 @@ class RunDirectory:
         """The run's checked settings."""
         settings = self.settings()
         try:
-            return settle(settings["algorithm"], settings["env"], settings)
+            return resolve(settings["algorithm"], settings["env"], settings)
         except KeyError as error:
             raise UsageError(f"{self.config_file}: damaged: {error} is missing") from None
 
     def rows(self, *kinds: str) -> list[Row]:
-        """All complete lines of the log; of some kinds only, the others are not even parsed."""
+        """All complete rows of the log, or only those of some kinds; others are not parsed."""
         if not self.metrics_file.exists():
             return []
         starts = tuple(f'{{"kind": "{kind}"' for kind in kinds) or ""
@@ -146,7 +146,7 @@ class RunDirectory:
             lines = self.metrics_file.read_text().split("\n")[:-1]
             found = [json.loads(line) for line in lines if line.startswith(starts)]
             if not all(isinstance(row, dict) for row in found):
-                raise ValueError("a line is no row")
+                raise ValueError("a line is not a table")
         except ValueError as error:
             raise UsageError(f"{self.metrics_file}: damaged: {error}") from None
         return found
@@ -161,7 +161,7 @@ class RunDirectory:
         return self.metrics_file.stat().st_size if self.metrics_file.exists() else 0
 
     def sync_log(self) -> int:
-        """Put the log on disk; its size in bytes."""
+        """Flush the log to disk; returns its size in bytes."""
         if not self.metrics_file.exists():
             return 0
         with self.metrics_file.open("a") as file:
@@ -169,13 +169,13 @@ class RunDirectory:
             return file.tell()
 
     def cut_log(self, size: int) -> bool:
-        """Cut the log back to what a checkpoint covers; False if rows are missing."""
+        """Truncate the log to what a checkpoint covers; False if rows are missing."""
         if self.metrics_file.exists():
             os.truncate(self.metrics_file, min(size, self.log_size()))
         return self.log_size() == size
 
     def sweep(self) -> None:
-        """Remove what a killed write left behind."""
+        """Remove the temporary files of a killed process."""
         for folder in (self.path, self.state_file.parent):
             for leftover in folder.glob(f"*{TEMPORARY}"):
                 leftover.unlink()
@@ -216,38 +216,6 @@ class RunDirectory:
         return False
 
 
-def provenance(backend: str | None) -> Row:
-    """What a result needs to be repeated: command, versions, commit, machine, threads, backend."""
-    return {
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "versions": versions(),
-        "commit": _commit(),
-        "threads": threads(),
-        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores",
-        "backend": backend,
-    }
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide results."""
-    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
-
-
-def _commit() -> str | None:
-    checkout = Path(__file__).parents[2]
-    if not (checkout / ".git").exists() or not (git := shutil.which("git")):
-        return None
-    describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
-    return found.stdout.strip() or None
-
-
-def threads() -> int:
-    """Size of XLA's thread pool, which decides result bits on a CPU."""
-    return int(os.environ.get("NPROC") or len(os.sched_getaffinity(0)))
-
-
 def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
     """All runs below a folder, in order."""
     for config in sorted(Path(runs).rglob("config.json")):
@@ -255,7 +223,7 @@ def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
 
 
 def find(name: str, runs: str | Path = "runs") -> RunDirectory:
-    """A run by its path, or by any tail of it that only one run has."""
+    """A run by its path, or by an end of its path that only one run has."""
     if (Path(name) / "config.json").exists():
         return RunDirectory(Path(name))
     parts = Path(name).parts
@@ -263,7 +231,7 @@ def find(name: str, runs: str | Path = "runs") -> RunDirectory:
     if len(found) == 1:
         return found[0]
     if found:
-        raise UsageError(f"run: '{name}' fits {', '.join(str(run.path) for run in found[:4])}")
+        raise UsageError(f"run: '{name}' matches {', '.join(str(run.path) for run in found[:4])}")
     known = [str(run.path) for run in find_all(runs)]
-    near = f"; there are {', '.join(known[:4])}" if known else f"; none is below {runs}"
+    near = f"; there are {', '.join(known[:4])}" if known else f"; no runs below {runs}"
     raise UsageError(f"run: '{name}' not found{near}")

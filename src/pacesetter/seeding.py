@@ -1,4 +1,4 @@
-"""Every random stream of a run, derived from its one seed, so that no stream shifts another."""
+"""The random streams of a run, all derived from one seed; none shifts another."""
 
 from enum import IntEnum
 
@@ -25,11 +25,10 @@ def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
 
 
 def episode_seed(seed: int, stream: Stream, index: int, episode: int) -> int:
-    """Seed of one episode's `reset`; its low bits are the stream, so streams never share a start;
-    it has 32 bits, which is all that older generators take.
+    """Seed of one episode's `reset`, of 32 bits, as older generators take no more.
 
-    An episode that is seeded by its number can be entered again at any time, which is what makes
-    a resumed run exact.
+    Its low bits are the stream, so streams never share a start. An episode seeded by its number
+    can be started again at any time, which makes a resumed run exact.
     """
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, index, episode))
     return int(sequence.generate_state(1)[0]) >> 3 << 3 | stream

@@ -1,4 +1,4 @@
-"""The settings that learners declare: kinds of values, the ranges `tune` searches, shared ones."""
+"""Settings of learners: kinds of values, ranges for `tune`, and what several learners share."""
 
 import re
 from typing import Annotated, Any, Literal, NamedTuple
@@ -32,7 +32,7 @@ def _duration(value: object) -> object:
 
 
 def only(value: float) -> AfterValidator:
-    """A setting that this algorithm fixes."""
+    """Refuse every value but the one that an algorithm fixes."""
 
     def check(given: float) -> float:
         if given != value:
@@ -43,38 +43,40 @@ def only(value: float) -> AfterValidator:
 
 
 def _only_with(*kinds: str) -> AfterValidator:
-    """A setting that only some kinds of replay use."""
+    """Refuse a setting that the chosen kind of replay does not use."""
 
     def check(value: object, info: ValidationInfo) -> object:
         kind = info.data.get("replay", kinds[0])
         if value not in (None, False) and kind not in kinds:
-            raise ValueError(f"is a setting of --replay {' and '.join(kinds)}, not of {kind}")
+            raise ValueError(f"applies to --replay {' and '.join(kinds)}, not to {kind}")
         return value
 
     return AfterValidator(check)
 
 
-def _has_weights(value: object, info: ValidationInfo) -> object:
+def _check_weights(value: object, info: ValidationInfo) -> object:
     kind, given = info.data.get("replay"), info.data.get("replay_importance")
     if value is not None and not (given or (given is None and REPLAYS.get(kind or "", (0, 1))[1])):
-        raise ValueError("is of importance weights, of which there are none; --replay-importance")
+        raise ValueError("needs importance weights, which are off; set --replay-importance")
     return value
 
 
-def _have_one_loss(quantiles: int, info: ValidationInfo) -> int:
+def _check_loss(quantiles: int, info: ValidationInfo) -> int:
     if quantiles and info.data.get("replay") == "lap":
-        raise ValueError("have a loss of their own, as has --replay lap; allowed with it: 0")
+        raise ValueError(
+            "cannot be combined with --replay lap, as each sets the loss; allowed with it: 0"
+        )
     return quantiles
 
 
-def _assessed(value: int | None, info: ValidationInfo) -> int | None:
+def _check_assess(value: int | None, info: ValidationInfo) -> int | None:
     if value is not None and not info.data.get("assess"):
-        raise ValueError("is a setting of --assess, which is off")
+        raise ValueError("needs --assess, which is off")
     return value
 
 
-ROWS_A_TICK = 1_000  # that a replay takes, of all members together
-# The exponents of priorities and of importance weights that each kind of replay has by itself.
+ROWS_A_TICK = 1_000  # transitions that a replay takes at a time, of all members together
+# Default exponents of each kind of replay: of priorities, and of importance weights.
 REPLAYS = {
     "uniform": (0.0, 0.0),
     "prioritized": (0.6, 0.4),
@@ -84,17 +86,19 @@ REPLAYS = {
 
 
 class Tune(NamedTuple):
-    """Range in which `tune` searches the setting that is annotated with it; or False and True."""
+    """The range in which `tune` searches a setting: two numbers, or False and True."""
 
     low: float
     high: float
     log: bool = False
 
     def has(self, value: Any) -> bool:
-        """Whether a value lies in it."""
+        """Whether a value is in the range."""
         return self.low <= value <= self.high
 
 
+NORMALIZE = "normalize observations by running mean and standard deviation, clip at 10"
+REPLAY_SIZE = "transitions kept; the oldest are overwritten first"
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
 Duration = Annotated[float, BeforeValidator(_duration)]
@@ -106,76 +110,82 @@ Switch = Annotated[bool, Tune(False, True)]
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Hyper:
-    """Settings that every algorithm has; each algorithm's own `Hyper` adds to them."""
+    """Settings of every algorithm; each algorithm's own `Hyper` adds to them."""
 
     gamma: Annotated[float, Tune(0.97, 0.999)] = Field(
-        0.99, ge=0, le=1, description="discount a step"
+        0.99, ge=0, le=1, description="discount factor per env step"
     )
-    normalize_observation: Switch = Field(
-        False, description="running mean and deviation, cut at 10"
-    )
+    normalize_observation: Switch = Field(False, description=NORMALIZE)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class OffPolicy(Hyper):
-    """Settings of every algorithm that learns from a replay."""
+    """Settings of every off-policy algorithm, which learns from a replay."""
 
     batch_size: Annotated[int, Tune(64, 512, log=True)] = Field(
-        256, ge=1, le=1_000_000, description="transitions in a minibatch"
+        256, ge=1, le=1_000_000, description="transitions per minibatch"
     )
-    replay_size: Count = Field(1_000_000, ge=1, description="transitions kept, oldest leave first")
+    replay_size: Count = Field(1_000_000, ge=1, description=REPLAY_SIZE)
     replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
-        "uniform", description="rows are drawn alike, by TD error (PER; LAP) or by episode return"
+        "uniform",
+        description="sample transitions uniformly, by TD error (PER or LAP) or by episode return",
     )
     replay_exponent: Annotated[float | None, _only_with("prioritized", "lap", "return")] = Field(
         None,
         ge=0,
         le=2,
-        description="power of priorities, 0 draws uniformly; none is 0.6, for lap 0.4",
+        description="priority exponent alpha; 0 samples uniformly; default 0.6, or 0.4 for lap",
     )
     replay_importance: Annotated[float | None, _only_with("prioritized", "return")] = Field(
         None,
         ge=0,
         le=1,
-        description="power of importance weights at first, later 1; 0 is no weights; "
-        "none is 0.4, for return 0",
+        description="initial importance exponent beta, annealed to 1; 0 disables weights; "
+        "default 0.4, or 0 for return",
     )
     replay_horizon: Annotated[
-        Count | None, _only_with("prioritized", "return"), AfterValidator(_has_weights)
-    ] = Field(None, ge=1, description="steps until that power is 1; none is --steps at the start")
+        Count | None, _only_with("prioritized", "return"), AfterValidator(_check_weights)
+    ] = Field(None, ge=1, description="env steps until beta is 1; default --steps")
     replay_to_go: Annotated[bool, _only_with("return")] = Field(
-        False, description="rank rows by what the episode still paid, not by all of it"
+        False, description="rank transitions by return to go instead of the whole episode's return"
     )
-    n_step: int = Field(1, ge=1, le=100, description="rewards summed before the target's value")
+    n_step: int = Field(1, ge=1, le=100, description="rewards summed in an n-step target")
     assess: int = Field(
-        0, ge=0, description="episodes that assess a policy before it learns on (TD7: 20); 0 is off"
+        0,
+        ge=0,
+        description="episodes that assess a policy before its next updates, as in TD7 (20 there); "
+        "0 disables assessment",
     )
-    assess_after: Annotated[Count | None, AfterValidator(_assessed)] = Field(
-        None, ge=0, description="a member's updates before which one assesses; none is 750000"
+    assess_after: Annotated[Count | None, AfterValidator(_check_assess)] = Field(
+        None,
+        ge=0,
+        description="updates of a member before assessments take several episodes; default 750000",
     )
-    warmup: Warmup = Field(25_000, ge=0, description="first steps of all members, uniform actions")
-    warmup_updates: bool = Field(False, description="update during the warm-up too")
+    warmup: Warmup = Field(
+        25_000, ge=0, description="env steps of uniformly random actions at the start, all members"
+    )
+    warmup_updates: bool = Field(False, description="also update during the warm-up")
     updates_per_step: float = Field(
-        1.0, gt=0, le=1_000, description="critic updates an own env step"
+        1.0, gt=0, le=1_000, description="critic updates per env step of the member"
     )
     update_at: Literal["step", "episode"] = Field(
-        "step", description="as they fall due, or all at the episode's end"
+        "step", description="update after each step, or make all due updates when the episode ends"
     )
     update_every: Count | None = Field(
-        None, ge=1, description="own steps between blocks of updates; none is 1"
+        None, ge=1, description="env steps of a member between blocks of updates; default 1"
     )
     precision: Literal["f32", "bf16"] = Field(
-        "f32", description="of what large matrix products multiply; sums are float32 in both"
+        "f32", description="precision of large matrix products; accumulation is always float32"
     )
 
     @property
     def block(self) -> int:
-        """Own env steps after which the updates that have fallen due are made."""
+        """Env steps of a member after which its due updates are made."""
         return self.update_every or 1
 
     @property
     def exponents(self) -> tuple[float, float]:
-        """Of priorities and of importance weights, given or the replay's own."""
+        """Exponents of priorities and of importance weights, given or the replay's default."""
         exponent, importance = REPLAYS[self.replay]
         if self.replay_exponent is not None:
             exponent = self.replay_exponent
@@ -186,42 +196,54 @@ class OffPolicy(Hyper):
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ActorCritic(OffPolicy):
-    """Settings of every learner with an actor, several critics and their slowly moving targets."""
+    """Settings of every off-policy learner with an actor, several critics and target networks."""
 
     hidden: tuple[Width, ...] = Field(
-        (256, 256), min_length=1, description="widths of hidden layers"
+        (256, 256), min_length=1, description="widths of the hidden layers"
     )
-    actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step size of the actor")
+    actor_learning_rate: LearningRate = Field(
+        3e-4, gt=0, description="Adam learning rate of the actor"
+    )
     critic_learning_rate: LearningRate = Field(
-        3e-4, gt=0, description="Adam step size of the critics"
+        3e-4, gt=0, description="Adam learning rate of the critics"
     )
-    tau: Tau = Field(0.005, gt=0, le=1, description="share of the network in a target update")
-    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
-    critic_layer_norm: Switch = Field(False, description="layer norm before each critic ReLU")
-    actor_layer_norm: Switch = Field(False, description="layer norm before each actor ReLU")
-    quantiles: Annotated[int, AfterValidator(_have_one_loss)] = Field(
+    tau: Tau = Field(0.005, gt=0, le=1, description="step size of the soft target update")
+    critics: int = Field(2, ge=1, le=100, description="critics; the target uses their minimum")
+    critic_layer_norm: Switch = Field(
+        False, description="use layer norm before each ReLU of the critics"
+    )
+    actor_layer_norm: Switch = Field(
+        False, description="use layer norm before each ReLU of the actor"
+    )
+    quantiles: Annotated[int, AfterValidator(_check_loss)] = Field(
         0,
         ge=0,
         le=1_000,
-        description="quantiles that a critic learns, usually 25; 0 learns the mean alone",
+        description="quantiles that each critic learns, usually 25; 0 learns only the mean",
     )
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class OnPolicy(Hyper):
-    """Settings of every algorithm that learns from the rollout just made, and then drops it."""
+    """Settings of every on-policy algorithm, which learns from its last rollout alone."""
 
-    parallel_envs: int = Field(16, ge=1, le=1000, description="envs of a rollout, stepped in turn")
-    rollout_length: Count = Field(64, ge=1, description="steps of each env in a rollout")
-    normalize_observation: bool = Field(True, description="running mean and deviation, cut at 10")
+    parallel_envs: int = Field(16, ge=1, le=1000, description="envs per rollout, stepped in turn")
+    rollout_length: Count = Field(64, ge=1, description="steps of each env per rollout")
+    normalize_observation: bool = Field(True, description=NORMALIZE)
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class ModelDriven(OnPolicy):
-    """Settings of every algorithm that learns from all steps so far, after each rollout."""
+    """Settings of every model-based algorithm that learns from all transitions after a rollout."""
 
-    parallel_envs: int = Field(1, ge=1, le=1000, description="envs of a rollout, stepped in turn")
-    rollout_length: Count = Field(3000, ge=1, description="steps of each env in a rollout")
-    replay_size: Count = Field(200_000, ge=1, description="transitions kept, oldest leave first")
-    starts: int = Field(20, ge=1, description="resets an update, for imagined episodes; no steps")
-    known: bool = Field(True, description="reward and end are the walker's own, not learned")
+    parallel_envs: int = Field(1, ge=1, le=1000, description="envs per rollout, stepped in turn")
+    rollout_length: Count = Field(3000, ge=1, description="steps of each env per rollout")
+    replay_size: Count = Field(200_000, ge=1, description=REPLAY_SIZE)
+    starts: int = Field(
+        20,
+        ge=1,
+        description="resets per update that start imagined episodes; not counted as env steps",
+    )
+    known: bool = Field(
+        True, description="use the walker's known reward and termination instead of learning them"
+    )

@@ -1,4 +1,4 @@
-"""Files that survive a kill and a stranger: arrays and JSON in safetensors, hashed and atomic."""
+"""Safe files: arrays and JSON in safetensors, hashed, replaced atomically, read without trust."""
 
 import hashlib
 import json
@@ -18,7 +18,7 @@ from pacesetter.types import Arrays
 TEMPORARY = ".pacesetter-tmp"
 
 
-# What reading a hostile file may raise besides UsageError.
+# What reading a damaged or hostile file may raise besides UsageError.
 FAULTS = (
     SafetensorError,
     ValueError,
@@ -64,7 +64,7 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
 
 
 def link(path: Path, to: Path) -> None:
-    """Make a file reachable by another name too, in place of what has that name."""
+    """Give a file a second name, in place of what had that name."""
     temporary = to.with_name(to.name + TEMPORARY)
     temporary.unlink(missing_ok=True)
     os.link(path, temporary)
@@ -102,7 +102,7 @@ def read(path: Path, kind: str) -> Content:
         data = path.read_bytes()
         manifest = _manifest(data)
         if manifest.get("kind") != kind:
-            raise UsageError(f"{path}: is no pacesetter {kind}")
+            raise UsageError(f"{path}: is not a pacesetter {kind}")
         arrays = load(data)
         hashes: Mapping[str, str] = json.loads(manifest["hashes"])
         damaged = [name for name in {*arrays, *hashes} if not _intact(name, arrays, hashes)]
@@ -112,7 +112,7 @@ def read(path: Path, kind: str) -> Content:
             raise UsageError(f"{path}: damaged: {', '.join(sorted(damaged)[:3])}")
         table = json.loads(manifest["table"])
         if not isinstance(table, dict):
-            raise ValueError("its table is none")
+            raise ValueError("its table is not a table")
         return Content(arrays, table)
     except FileNotFoundError:
         raise UsageError(f"{path}: no such file") from None
@@ -126,7 +126,7 @@ def read(path: Path, kind: str) -> Content:
 def _manifest(data: bytes) -> dict[str, str]:
     size = int.from_bytes(data[:8], "little")
     if not 2 <= size <= len(data) - 8:
-        raise ValueError("its header is cut off")
+        raise ValueError("its header is truncated")
     header = json.loads(data[8 : 8 + size])
     return header.get("__metadata__", {})
 

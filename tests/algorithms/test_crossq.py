@@ -20,7 +20,7 @@ from numeric import (
 from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms import crossq
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.networks import batch_renorm
 from pacesetter.policy import Policy, unstack
 from pacesetter.training.trainer import Trainer
@@ -274,7 +274,7 @@ def test_policy_and_acting_are_plain_networks(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize(("name", "width"), [("crossq", 2048), ("crossq-small", 256)])
 def test_presets(name: str, width: int) -> None:
     """The paper's critics are 2048 wide, the small ones as wide as the actor."""
-    hyper = settle(name, "Walker2d-v5").hyper
+    hyper = resolve(name, "Walker2d-v5").hyper
     assert (hyper.hidden, hyper.critic_hidden) == ((256, 256), (width, width))
     assert (hyper.policy_delay, hyper.adam_momentum, hyper.warmup) == (3, 0.5, 5000)
     state = jax.eval_shape(crossq.CrossQ(SPEC, hyper).init, KEY)

@@ -11,7 +11,7 @@ from numeric import KEY, close, member, random_batch, random_state, slopes, squa
 from conftest import TINY, run_to_end
 from pacesetter.algorithms import crossq
 from pacesetter.batch import Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.networks import batch_renorm
 from pacesetter.training.trainer import Trainer
 
@@ -199,9 +199,9 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
 def test_presets() -> None:
     """The options are off in `crossq` and `crossq-small`; the lean ones turn them on."""
     for name in ("crossq", "crossq-small"):
-        hyper = settle(name, "Walker2d-v5").hyper
+        hyper = resolve(name, "Walker2d-v5").hyper
         assert (hyper.weight_norm, hyper.next_batch_gradient) == (False, True)
-    lean, kept = (settle(n, "Walker2d-v5").hyper for n in ("crossq-lean", "crossq-wn"))
+    lean, kept = (resolve(n, "Walker2d-v5").hyper for n in ("crossq-lean", "crossq-wn"))
     assert (lean.critic_hidden, lean.weight_norm) == ((256, 256), False)
     assert (kept.critic_hidden, kept.weight_norm) == ((256, 256), True)
     assert not lean.next_batch_gradient

@@ -16,7 +16,7 @@ from pacesetter import config
 from pacesetter.algorithms import me_trpo, trpo
 from pacesetter.batch import Batch, Layout, Spec
 from pacesetter.cli.main import main
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.dynamics.model import Dynamics, Known, Models
 from pacesetter.errors import UsageError
 from pacesetter.networks import trust_region
@@ -386,7 +386,7 @@ def test_no_key_is_used_twice(renew_every: int, noise: bool) -> None:
 )
 def test_what_makes_no_sense_is_refused(name: str, settings: Any, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        settle(name, "Hopper-v5", settings)
+        resolve(name, "Hopper-v5", settings)
 
 
 @pytest.mark.parametrize("length", [249, 40_000])
@@ -404,7 +404,7 @@ def test_unknown_reward_is_refused_unless_it_is_learned(runs: Path) -> None:
 
 def test_preset_builds_with_the_values_of_its_file() -> None:
     table = config.presets()["me-trpo-paper"]
-    run, hyper = settle("me-trpo-paper", "HalfCheetah-v5")
+    run, hyper = resolve("me-trpo-paper", "HalfCheetah-v5")
     for key in table.keys() - {"algorithm", "help", "source", "env"}:
         value = table[key]
         assert getattr(hyper, key) == (tuple(value) if isinstance(value, list) else value), key
@@ -416,7 +416,7 @@ def test_preset_builds_with_the_values_of_its_file() -> None:
 
 
 def test_published_sizes() -> None:
-    hyper = settle("me-trpo-paper", "Humanoid-v5").hyper
+    hyper = resolve("me-trpo-paper", "Humanoid-v5").hyper
     assert hyper.model_hidden == (1024, 1024)
     assert (hyper.models, hyper.imagined_steps, hyper.policy_updates) == (5, 50_000, 400)
     assert (hyper.rollout_length, hyper.horizon, hyper.bootstrap) == (6_000, 100, False)

@@ -16,7 +16,7 @@ from pacesetter.algorithms.steve import STEVE, combine
 from pacesetter.algorithms.steve_td3 import SteveTD3
 from pacesetter.algorithms.td3 import State
 from pacesetter.batch import Batch
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.dynamics.model import Dynamics, Known
 from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.errors import UsageError
@@ -344,5 +344,5 @@ def test_settings_that_cannot_work_are_refused() -> None:
         ("steve", {"policy_delay": 2}, "policy_delay: is fixed"),
     ):
         with pytest.raises(UsageError, match=message):
-            settle(name, "Hopper-v5", settings)
-    assert settle("steve-td3", "Hopper-v5", {"horizon": 0, "critic_members": 1}).hyper.horizon == 0
+            resolve(name, "Hopper-v5", settings)
+    assert resolve("steve-td3", "Hopper-v5", {"horizon": 0, "critic_members": 1}).hyper.horizon == 0

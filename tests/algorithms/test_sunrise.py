@@ -14,7 +14,7 @@ from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms import sunrise
 from pacesetter.batch import Batch, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.ensemble import members
 from pacesetter.errors import UsageError
 from pacesetter.networks import mlp
@@ -478,21 +478,21 @@ def test_blocks_longer_than_a_tick_are_made_whole(
 @pytest.mark.parametrize("other", [{"update_at": "episode"}, {"assess": 2}])
 def test_blocks_and_episode_ends_are_refused_together(other: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="update_every: blocks of 50 steps"):
-        settle("td3", "HalfCheetah-v5", {"update_every": 50, **other})
+        resolve("td3", "HalfCheetah-v5", {"update_every": 50, **other})
 
 
 def test_forms_have_their_blocks() -> None:
     env = "HalfCheetah-v5"
-    assert settle("sunrise", env).hyper.block == 1
-    assert settle("sunrise", env, {"reference": "official"}).hyper.block == 1000
-    assert settle("sunrise", env, {"reference": "official", "update_every": 5}).hyper.block == 5
-    assert settle("td3", env, {"update_every": 50}).hyper.block == 50
+    assert resolve("sunrise", env).hyper.block == 1
+    assert resolve("sunrise", env, {"reference": "official"}).hyper.block == 1000
+    assert resolve("sunrise", env, {"reference": "official", "update_every": 5}).hyper.block == 5
+    assert resolve("td3", env, {"update_every": 50}).hyper.block == 50
 
 
 @pytest.mark.parametrize("env", ["HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5"])
 def test_presets(env: str) -> None:
     """The official preset knows each of the four tasks."""
-    config = settle("sunrise-official", env)
+    config = resolve("sunrise-official", env)
     hyper = config.hyper
     assert (hyper.reference, hyper.ensemble, hyper.warmup) == ("official", 5, 1000)
     assert (hyper.mask_probability, hyper.backup_temperature, hyper.ucb) == (0.5, 20, 1)
@@ -502,7 +502,7 @@ def test_presets(env: str) -> None:
 def test_other_noise_is_refused() -> None:
     """Proposals of TD3 learners have Gaussian noise."""
     with pytest.raises(UsageError, match=r"exploration: .*gaussian"):
-        settle("sunrise-td3", "HalfCheetah-v5", {"exploration": "ou"})
+        resolve("sunrise-td3", "HalfCheetah-v5", {"exploration": "ou"})
 
 
 @both
@@ -528,6 +528,6 @@ def test_nothing_is_nan(name: str, reference: Any, runs: Path, nans_raise: None)
 @both
 def test_settings_of_the_base_keep_their_defaults(name: str) -> None:
     """Such as SAC's warm-up of 10k; only the exploration of TD3's proposals is fixed."""
-    ours, base = (settle(each, "HalfCheetah-v5").hyper for each in (name, BASES[name]))
+    ours, base = (resolve(each, "HalfCheetah-v5").hyper for each in (name, BASES[name]))
     for setting in vars(base):
         assert getattr(ours, setting) == getattr(base, setting), setting

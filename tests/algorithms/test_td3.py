@@ -15,7 +15,7 @@ from short_runs import TINY, run_to_end
 from pacesetter import algorithms
 from pacesetter.algorithms.td3 import TD3, State
 from pacesetter.batch import Batch, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.evaluation import evaluate
 from pacesetter.networks import mlp
 from pacesetter.policy import Policy, load, to_env, unstack
@@ -464,7 +464,7 @@ def test_ddpg_is_td3_without_its_tricks(minibatches: Minibatches) -> None:
 
 def test_original_ddpg_is_as_published() -> None:
     """Its preset: sizes, rates, decay, noise and where the action joins."""
-    hyper = settle("ddpg-original", "Walker2d-v5").hyper
+    hyper = resolve("ddpg-original", "Walker2d-v5").hyper
     assert (hyper.hidden, hyper.batch_size, hyper.tau) == ((400, 300), 64, 1e-3)
     assert (hyper.actor_learning_rate, hyper.critic_learning_rate) == (1e-4, 1e-3)
     assert (hyper.critic_decay, hyper.action_layer, hyper.output_bound) == (1e-2, 1, 3e-3)

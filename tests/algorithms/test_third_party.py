@@ -15,7 +15,7 @@ from stopping import stop_at
 
 from pacesetter import algorithms
 from pacesetter.cli.main import main
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.training.trainer import Trainer
@@ -90,7 +90,7 @@ def test_an_installed_package_can_name_it(
     (folder / "entry_points.txt").write_text(f"[pacesetter.algorithms]\nbare = {NAME}\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert algorithms.find("bare") is third_party.Plain
-    config = settle("multi-bare", TASK, {"width": 7})
+    config = resolve("multi-bare", TASK, {"width": 7})
     assert (config.run.algorithm, config.run.members, config.hyper.width) == ("bare", 2, 7)
     assert main(["list", "algorithms"]) == 0
     assert NAME in capsys.readouterr().out
@@ -125,6 +125,6 @@ def test_commands_know_it_from_its_file_alone(tmp_path: Path) -> None:
 
 
 def test_ensemble_of_a_foreign_algorithm_has_its_own_name() -> None:
-    run, _ = settle("multi-third_party:Plain", "Pendulum-v1")
+    run, _ = resolve("multi-third_party:Plain", "Pendulum-v1")
     assert (run.algorithm, run.members, run.rule) == ("third_party:Plain", 2, "best")
     assert run.name == "multi-third_party-Plain"

@@ -19,7 +19,7 @@ from pacesetter.algorithms import trpo
 from pacesetter.algorithms.contract import Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.cli.main import main
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.networks import trust_region
 from pacesetter.training.trainer import Trainer
@@ -541,4 +541,4 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
 )
 def test_what_makes_no_sense_is_refused(name: str, settings: Any, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        settle(name, "Hopper-v5", settings)
+        resolve(name, "Hopper-v5", settings)

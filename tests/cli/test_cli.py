@@ -21,11 +21,12 @@ from pacesetter.algorithms import ddpg
 from pacesetter.batch import Spec
 from pacesetter.cli.flags import split_env_kwargs
 from pacesetter.cli.main import VERBS, main
-from pacesetter.config import Run, settle
+from pacesetter.config import Run, resolve
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.runs import RunDirectory, find
 from pacesetter.training.trainer import Trainer
+from pacesetter.validation import fields_of
 
 PROBE = "broken_envs:Probe-v0"
 SMALL = [
@@ -153,7 +154,7 @@ def test_help_of_train_has_every_setting(command: Command) -> None:
 
 NO_JAX = """
 import sys
-from pacesetter.cli import main
+from pacesetter.cli.main import main
 for words in ["--help", "--version", "train --help", "resume --help", "eval --help", "list --help",
               "show --help", "bench --help", "tune --help", "list algorithms", "list envs",
               "list rules", "list presets", "list suites", "list runs"]:
@@ -218,14 +219,14 @@ DURATIONS = {"90": 90, "90s": 90, "5m": 300, "2h": 7_200, "1d": 86_400, "0.5h": 
 
 @pytest.mark.parametrize("text", COUNTS)
 def test_counts(text: str) -> None:
-    run, hyper = settle("td3", "X-v0", {"steps": text, "replay_size": text})
+    run, hyper = resolve("td3", "X-v0", {"steps": text, "replay_size": text})
     assert run.steps == hyper.replay_size == COUNTS[text]
     assert type(run.steps) is int
 
 
 @pytest.mark.parametrize("text", DURATIONS)
 def test_durations(text: str) -> None:
-    run, _ = settle("td3", "X-v0", {"time": text, "checkpoint_every": text})
+    run, _ = resolve("td3", "X-v0", {"time": text, "checkpoint_every": text})
     assert run.time == run.checkpoint_every == DURATIONS[text]
 
 
@@ -374,18 +375,20 @@ def test_flags_are_settings(algorithm: str, command: Command) -> None:
 def test_every_flag_is_tried() -> None:
     """A new setting needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
-    settings = config.names_of(Run) | config.names_of(ddpg.Hyper)
+    settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
     assert settings - tried == {"algorithm", "env", "env_kwargs"}
 
 
 # Those of learners with a state of their own kind are built beside the other tests of it.
-BUILT = [n for n, table in config.presets().items() if not algorithms.alone(table["algorithm"])]
+BUILT = [
+    n for n, table in config.presets().items() if not algorithms.single_member(table["algorithm"])
+]
 
 
 @pytest.mark.parametrize("name", [*BUILT, *(f"multi-{name}" for name in BUILT)])
 def test_every_preset_builds(name: str) -> None:
     """On HalfCheetah; its values are those of the file."""
-    run, hyper = settle(name, "HalfCheetah-v5")
+    run, hyper = resolve(name, "HalfCheetah-v5")
     learner = algorithms.find(run.algorithm).build(Spec(17, 6), hyper)
     state = jax.eval_shape(learner.init, jax.random.key(0))
     assert state.actor[0]["kernel"].shape[-2:] == (17, hyper.hidden[0])

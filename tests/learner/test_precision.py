@@ -10,7 +10,7 @@ import pytest
 
 from pacesetter import Trainer, algorithms
 from pacesetter.batch import Batch, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.learner.precision import bfloat16_products
 from pacesetter.networks import mlp
@@ -103,7 +103,7 @@ def test_small_products_and_other_operations_stay_as_they_are() -> None:
 @pytest.mark.parametrize("name", ["td3", "sac"])
 def test_an_update_differs_by_rounding_alone(name: str) -> None:
     """Every parameter stays float32 and goes nearly the same way, but not quite."""
-    algorithm = algorithms.find(name).build(Spec(17, 6), settle(name, "HalfCheetah-v5").hyper)
+    algorithm = algorithms.find(name).build(Spec(17, 6), resolve(name, "HalfCheetah-v5").hyper)
     shapes = {"observation": (17,), "action": (6,), "next_observation": (17,)}
     rows = (algorithm.updates_per_call, 64)
     fields = {f: RNG.normal(size=(*rows, *shapes.get(f, ()))) for f in Batch._fields}
@@ -136,6 +136,6 @@ def test_a_run_asks_for_it_by_name(tmp_path: Path) -> None:
 
 def test_learners_of_rollouts_refuse_it() -> None:
     with pytest.raises(UsageError, match="precision"):
-        settle("trpo", "Hopper-v5", {"precision": "bf16"})
+        resolve("trpo", "Hopper-v5", {"precision": "bf16"})
     with pytest.raises(UsageError, match=r"precision: .*did you mean bf16"):
-        settle("td3", "Hopper-v5", {"precision": "f16"})
+        resolve("td3", "Hopper-v5", {"precision": "f16"})

@@ -22,7 +22,7 @@ from pacesetter import algorithms
 from pacesetter.cli import bench_progress
 from pacesetter.cli.flags import add_settings, parser, split_env_kwargs
 from pacesetter.cli.main import main
-from pacesetter.config import Config, Run, settle
+from pacesetter.config import Config, Run, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.study.bench import queue as bench_module
@@ -80,7 +80,7 @@ def entries() -> Iterator[Any]:
 def parsed(words: list[str]) -> Config:
     """The settings of a `train` command line, as the command line itself reads them."""
     _, algorithm, env, *flags = words
-    defaults = settle(algorithm, env).settings()
+    defaults = resolve(algorithm, env).settings()
     command = parser("train", "")
     add_settings(command, "run", Run, defaults)
     add_settings(command, "its own", algorithms.find(defaults["algorithm"]).Hyper, defaults)
@@ -88,7 +88,7 @@ def parsed(words: list[str]) -> Config:
     rest, env_kwargs = split_env_kwargs(flags)
     found = vars(command.parse(rest))
     found.pop("runs")
-    return settle(algorithm, env, found, {"env_kwargs": env_kwargs})
+    return resolve(algorithm, env, found, {"env_kwargs": env_kwargs})
 
 
 @pytest.mark.parametrize(("name", "entry"), [*entries()])

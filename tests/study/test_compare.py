@@ -445,7 +445,7 @@ def test_bad_words_are_one_line(
 
 def test_help_imports_neither_jax_nor_scipy() -> None:
     code = (
-        "import sys\nfrom pacesetter.cli import main\n"
+        "import sys\nfrom pacesetter.cli.main import main\n"
         "try:\n    main(['compare', '--help'])\nexcept SystemExit:\n    pass\n"
         "print({'jax', 'scipy', 'matplotlib'} & set(sys.modules))"
     )
@@ -455,7 +455,7 @@ def test_help_imports_neither_jax_nor_scipy() -> None:
 
 def test_comparing_imports_no_jax(runs: Path) -> None:
     code = (
-        "import sys\nfrom pacesetter.cli import main\n"
+        "import sys\nfrom pacesetter.cli.main import main\n"
         f"main(['compare', {str(runs)!r}, '-o', 'a.html', '--no-film'])\n"
         "print('jax' in sys.modules)"
     )

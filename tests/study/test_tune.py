@@ -17,13 +17,15 @@ from short_runs import TINY
 
 from pacesetter import algorithms
 from pacesetter.cli.main import main
-from pacesetter.config import settle
+from pacesetter.cli.progress import console
+from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import RunDirectory, find, find_all
 from pacesetter.study.bench.suite import TUNING_SEEDS, expand, of_algorithms
 from pacesetter.study.tune import search as tune
 from pacesetter.study.tune.journal import distribution, ranges
 from pacesetter.study.tune.search import Tuning
+from pacesetter.training.trainer import Trainer
 
 optuna = pytest.importorskip("optuna")
 
@@ -49,6 +51,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def silent(trainer: Trainer) -> Any:
+    """Shows nothing of a trial."""
+    return console(trainer, quiet=True)
+
+
 def study(trials: int = 3, file: str = "study.log", **fixed: Any) -> Tuning:
     return Tuning("td3", PROBE, FIXED | fixed, trials, file)
 
@@ -64,7 +71,7 @@ def made(tuning: Tuning) -> list[Any]:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     """Three trials that nobody stopped."""
     tuning = study(file=str(tmp_path_factory.mktemp("undisturbed") / "study.log"))
-    tuning.run(quiet=True)
+    tuning.run(silent)
     return made(tuning)
 
 
@@ -76,7 +83,7 @@ def test_ranges(name: str) -> None:
     assert found
     for key, one in found.items():
         for end in (one.low, one.high):
-            assert getattr(settle(name, "X-v0", {key: end}).hyper, key) == end
+            assert getattr(resolve(name, "X-v0", {key: end}).hyper, key) == end
             assert distribution(one)._contains(end)
     assert key not in ranges(hyper, {key: 1})
 
@@ -95,7 +102,7 @@ def test_a_study(undisturbed: list[Any]) -> None:
     """It begins with the defaults; each trial reports every evaluation."""
     assert [state for state, *_ in undisturbed] == ["COMPLETE"] * 3
     first = undisturbed[0][2]
-    usual = settle("td3", PROBE, FIXED).settings()
+    usual = resolve("td3", PROBE, FIXED).settings()
     assert first == {key: usual[key] for key in first}
     assert first != undisturbed[1][2] != undisturbed[2][2]
     for _, value, _, reported in undisturbed:
@@ -140,7 +147,7 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
 def test_report_seeds_are_never_tuning_seeds() -> None:
     """Those of trials start where those that `bench` takes end."""
     tuning = study(trials=2)
-    tuning.run(quiet=True)
+    tuning.run(silent)
     seeds = {run.settings()["seed"] for run in find_all(tuning.runs)}
     assert seeds == {TUNING_SEEDS, TUNING_SEEDS + 1}
     suite = of_algorithms(["td3"])
@@ -161,7 +168,7 @@ def stop_after(tuning: Tuning, evaluations: int) -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tune, "_score", count)
-        tuning.run(quiet=True)
+        tuning.run(silent)
 
 
 @pytest.mark.slow
@@ -172,7 +179,7 @@ def test_stopped_study_goes_on(undisturbed: list[Any]) -> None:
     assert [state for state, *_ in made(stopped)] == ["COMPLETE", "RUNNING"]
     assert not stopped.over
     going_on = study()
-    going_on.run(quiet=True)
+    going_on.run(silent)
     assert going_on.over
     assert made(going_on) == undisturbed
     (resumed,) = [r for r in find_all(going_on.runs) if r.record().get("resumed")]
@@ -205,7 +212,7 @@ def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:
     """It stops early and is never the best."""
     tuning = study(trials=2)
     tuning.study.pruner = optuna.pruners.ThresholdPruner(lower=1e9)
-    tuning.run(quiet=True)
+    tuning.run(silent)
     assert [state for state, *_ in made(tuning)] == ["PRUNED"] * 2
     assert all(list(reported) == [1] for *_, reported in made(tuning))
     assert not tuning.best_file.exists()
@@ -221,7 +228,7 @@ def test_bad_trials_are_pruned_by_what_others_reported(monkeypatch: pytest.Monke
     scores = iter([10.0] * 25)
     monkeypatch.setattr(tune, "_score", lambda rows: next(scores, -5.0))
     tuning = study(trials=6)
-    tuning.run(quiet=True)
+    tuning.run(silent)
     assert [state for state, *_ in made(tuning)] == ["COMPLETE"] * 5 + ["PRUNED"]
 
 
@@ -237,7 +244,7 @@ def test_failed_trial_counts_and_the_study_goes_on(
         return make(trial)
 
     monkeypatch.setattr(tuning, "_trainer_of", fail)
-    tuning.run(quiet=True)
+    tuning.run(silent)
     assert [state for state, *_ in made(tuning)] == ["FAIL", "COMPLETE"]
     assert "trial 0 of 2: failed: member 0, step 3: a bolt fell out\n" in capsys.readouterr().err
     assert tuning.summary().startswith("1 trials, 0 pruned, 1 failed; best")
@@ -278,7 +285,7 @@ def test_bad_task(env: str, here: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_nothing_left_to_search() -> None:
-    given = {name: getattr(settle("td3", PROBE).hyper, name) for name in
+    given = {name: getattr(resolve("td3", PROBE).hyper, name) for name in
              ranges(algorithms.find("td3").Hyper, {})}  # fmt: skip
     with pytest.raises(UsageError, match="no setting is left to search"):
         study(**given)

@@ -1,4 +1,4 @@
-"""One progress display for all runs of a bench, on stderr: bars on a terminal, lines elsewhere."""
+"""Progress of all runs of a bench on stderr: bars on a terminal, plain lines elsewhere."""
 
 import json
 import os
@@ -6,21 +6,26 @@ import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from datetime import timedelta
+from typing import TYPE_CHECKING, Any
 
+from pacesetter.cli.progress import Pace, bars
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.study.bench.queue import Bench
 from pacesetter.study.bench.suite import Job
 
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
 Show = Callable[[Bench], None]
 TAIL = 2**18  # bytes of a log in which its last evaluation is looked for
 LOOK_EVERY = 1.0  # seconds
+LOOKS = 600  # over which the speed is taken
 LINE_EVERY = 300.0  # seconds between lines that say how far all is
 
 
 @contextmanager
 def display(bench: Bench, quiet: bool = False) -> Generator[Show]:
-    """What shows a bench whenever it is called with it."""
+    """What shows how far a bench is, each time it is called with it."""
     if quiet:
         yield lambda bench: None
     elif sys.stderr.isatty():
@@ -30,43 +35,37 @@ def display(bench: Bench, quiet: bool = False) -> Generator[Show]:
         yield _lines(bench)
 
 
-class _Pace:
-    """Env steps of all runs that have not failed, and the time left at the speed so far."""
+class _Total:
+    """Env steps of all runs that have not failed, and the time left at the speed of late."""
 
     def __init__(self, bench: Bench) -> None:
-        self._budgets = {str(job): _budget(job) for job in bench.jobs}
+        self._budgets = {str(job): job.config.budget for job in bench.jobs}
         self._steps = {str(job): _last(job.directory)[0] for job in bench.left}
-        self._began = time.monotonic()
-        self._first = self.read(bench)[0]
+        self._pace = Pace(self._count(bench)[0], time.monotonic(), LOOKS)
 
-    def read(self, bench: Bench) -> tuple[int, int, str]:
-        """Steps made, steps in all, and the time left as text."""
+    def _count(self, bench: Bench) -> tuple[int, int]:
         for job, _, _ in bench.running.values():
             self._steps[str(job)] = _last(job.directory)[0]
         self._steps |= {str(job): self._budgets[str(job)] for job in bench.finished}
         counted = self._budgets.keys() - bench.failed.keys()
         done = sum(min(self._steps[name], self._budgets[name]) for name in counted)
-        total = sum(self._budgets[name] for name in counted)
-        return done, total, self._left(done, total)
+        return done, sum(self._budgets[name] for name in counted)
 
-    def _left(self, done: int, total: int) -> str:
-        made = done - getattr(self, "_first", done)
-        if made <= 0:
-            return "-"
-        seconds = (time.monotonic() - self._began) * (total - done) / made
-        return str(timedelta(seconds=round(seconds)))
+    def read(self, bench: Bench) -> tuple[int, int, str]:
+        """Steps made, steps in all, and the time left as text."""
+        done, total = self._count(bench)
+        return done, total, self._pace.read(done, time.monotonic(), total)[1]
 
 
 def _lines(bench: Bench) -> Show:
-    pace = _Pace(bench)
-    said = time.monotonic()
+    steps, printed_at = _Total(bench), time.monotonic()
 
     def show(bench: Bench) -> None:
-        nonlocal said
-        late = time.monotonic() - said > LINE_EVERY
+        nonlocal printed_at
+        late = time.monotonic() - printed_at > LINE_EVERY
         for line in bench.news or ([""] if late else []):
-            said = time.monotonic()
-            done, total, left = pace.read(bench)
+            printed_at = time.monotonic()
+            done, total, left = steps.read(bench)
             state = f"{len(bench.finished)} of {len(bench.jobs)} runs  "
             state += f"step {done:,} of {total:,}  ETA {left}"
             print(f"{line}  [{state}]" if line else state, file=sys.stderr, flush=True)
@@ -77,49 +76,39 @@ def _lines(bench: Bench) -> Show:
 
 @contextmanager
 def _bars(bench: Bench) -> Generator[Show]:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn
-
-    pace, looked = _Pace(bench), 0.0
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-        TextColumn("{task.fields[note]}"),
-    )
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=2) as bar:
-        whole = bar.add_task("all runs", total=pace.read(bench)[1], note="")
-        rows: dict[str, TaskID] = {}
+    steps, looked = _Total(bench), 0.0
+    rows: dict[str, Any] = {}  # a bar for each job that runs
+    with bars() as shown:
+        whole = shown.add_task("all runs", total=steps.read(bench)[1], note="")
 
         def show(bench: Bench) -> None:
             nonlocal looked
             for line in bench.news:
-                bar.console.print(line, highlight=False, markup=False)
+                shown.console.print(line, highlight=False, markup=False)
             bench.news.clear()
             if time.monotonic() - looked < LOOK_EVERY:
                 return
             looked = time.monotonic()
-            done, total, left = pace.read(bench)
+            done, total, left = steps.read(bench)
             note = f"{len(bench.finished)} of {len(bench.jobs)} runs  ETA {left}"
-            bar.update(whole, completed=done, total=total, note=note)
-            running = {str(job): job for job, _, _ in bench.running.values()}
-            for name in rows.keys() - running.keys():
-                bar.remove_task(rows.pop(name))
-            for name, job in running.items():
-                if name not in rows:
-                    rows[name] = bar.add_task(name, total=_budget(job), note="")
-                step, result = _last(job.directory)
-                bar.update(rows[name], completed=step, note=f"return {result}")
+            shown.update(whole, completed=done, total=total, note=note)
+            _update_rows(shown, rows, {str(job): job for job, _, _ in bench.running.values()})
 
         yield show
 
 
-def _budget(job: Job) -> int:
-    return job.config.run.steps * job.config.unit
+def _update_rows(shown: "Progress", rows: dict[str, Any], running: dict[str, Job]) -> None:
+    for name in rows.keys() - running.keys():
+        shown.remove_task(rows.pop(name))
+    for name, job in running.items():
+        if name not in rows:
+            rows[name] = shown.add_task(name, total=job.config.budget, note="")
+        step, result = _last(job.directory)
+        shown.update(rows[name], completed=step, note=f"return {result}")
 
 
 def _last(directory: RunDirectory) -> tuple[int, str]:
-    """Step of a log's last whole row, and its last return as text."""
+    """The step of a log's last whole line, and its last evaluation's return as text."""
     try:
         with directory.metrics_file.open("rb") as file:
             file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
@@ -130,7 +119,7 @@ def _last(directory: RunDirectory) -> tuple[int, str]:
     for line in reversed(lines):
         try:
             row: Row = json.loads(line)
-        except ValueError:  # cut at its beginning
+        except ValueError:  # its beginning is missing
             break
         step = step or row["step"]
         if row["kind"] == "eval":

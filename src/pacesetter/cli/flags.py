@@ -2,18 +2,19 @@
 
 import argparse
 import tomllib
-from dataclasses import fields
+from collections.abc import Collection
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
+from pacesetter.validation import fields_of
 
 _POSITIONAL = {"algorithm", "env", "env_kwargs"}
-_BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below", "min_length": "length"}
+_BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse whose errors are one line and whose unknown flags are met with the nearest ones."""
+    """An argparse parser with one-line errors, which names the flags nearest to an unknown one."""
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message[:1].lower()}{message[1:]}; see `{self.prog} --help`")
@@ -35,36 +36,77 @@ class Parser(argparse.ArgumentParser):
 
 
 def parser(prog: str, description: str) -> Parser:
-    """A parser that takes flags in full only, so that new flags never change what a line means."""
+    """A parser that takes whole flags only: then a new flag never changes what a command means."""
     return Parser(prog=f"pacesetter {prog}", description=description, allow_abbrev=False)
 
 
-def add_settings(command: Parser, title: str, kind: type, defaults: Settings | None) -> None:
+def algorithm_and_env(command: Parser, words: list[str]) -> tuple[str, str, list[str]]:
+    """The first two words of `train` and `tune`, and the rest; without them, help or a refusal."""
+    given = [word for word in words[:2] if not word.startswith("-")]
+    if len(given) == 2:
+        return given[0], given[1], words[2:]
+    command.add_argument("ALGO", help="algorithm or preset; see `pacesetter list algorithms`")
+    command.add_argument("ENV", help="Gymnasium id such as HalfCheetah-v5, or module:Id-v0")
+    command.epilog = f"`{command.prog} ALGO ENV --help` lists every setting with its default."
+    command.usage = f"{command.prog} ALGO ENV [--SETTING VALUE ...]"
+    if not {"-h", "--help"} & {*words} and len(words) >= 2:
+        raise UsageError(f"{command.prog.split()[-1]}: ALGO and ENV come first, then settings")
+    command.parse(words)
+    raise AssertionError("argparse ends on too few words")
+
+
+def add_runs(command: Parser) -> None:
+    """`--runs`, the folder of all runs."""
+    command.add_argument(
+        "--runs", default="runs", metavar="DIR", help="folder of runs (default runs)"
+    )
+
+
+def add_quiet(command: Parser) -> None:
+    """`--quiet`, for verbs that show progress."""
+    command.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+
+
+def add_env_keywords(command: Parser) -> None:
+    """`--env.KEY`, for help alone: `split_env_kwargs` takes it out of the words."""
+    command.add_argument("--env.KEY", metavar="VALUE", help="keyword for the env's constructor")
+
+
+def add_settings(
+    command: Parser,
+    title: str,
+    kind: type,
+    defaults: Settings | None,
+    hidden: Collection[str] = (),
+) -> None:
     """A group of flags: one for each field of a settings class, with help, range and default.
 
-    Without defaults, for settings of several algorithms, one flag serves all that have it.
+    Without defaults, for settings of several algorithms, one flag serves all that have it. Hidden
+    flags are parsed, so that their refusal says why, but are not in the help.
     """
-    into = command.add_argument_group(title)
-    infos: dict[str, Any] = kind.__dict__["__pydantic_fields__"]
-    for field in fields(kind):
-        flag = "--" + field.name.replace("_", "-")
-        if field.name in _POSITIONAL or (defaults is None and command.knows(flag)):
+    group = command.add_argument_group(title)
+    for name, info in fields_of(kind).items():
+        flag = "--" + name.replace("_", "-")
+        if name in _POSITIONAL or (defaults is None and command.knows(flag)):
             continue
-        info = infos[field.name]
-        words = [info.description, *_allowed(info)]
-        words += [] if defaults is None else [f"default {_show(defaults[field.name])}"]
-        options: dict[str, Any] = {
-            "help": (words[0] + f" ({'; '.join(words[1:])})" * bool(words[1:])).replace("%", "%%"),
-            "default": argparse.SUPPRESS,
-            "dest": field.name,
-        }
+        options: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": name}
+        options["help"] = argparse.SUPPRESS if name in hidden else _help(name, info, defaults)
         if info.annotation is bool:
             options["action"] = argparse.BooleanOptionalAction
         elif get_origin(info.annotation) is tuple:
             options |= {"nargs": "+", "metavar": "N"}
         else:
             options["metavar"] = "X"
-        into.add_argument(flag, **options)
+        group.add_argument(flag, **options)
+
+
+def _help(name: str, info: Any, defaults: Settings | None) -> str:
+    """Description (range; default X); the description itself says what a default of None means."""
+    notes = _allowed(info)
+    if defaults is not None and defaults[name] is not None:
+        notes.append(f"default {_show(defaults[name])}")
+    text = f"{info.description} ({'; '.join(notes)})" if notes else info.description
+    return text.replace("%", "%%")
 
 
 def split_env_kwargs(arguments: list[str]) -> tuple[list[str], Settings]:
@@ -95,15 +137,17 @@ def _value(text: str) -> Any:
 
 
 def _allowed(info: Any) -> list[str]:
+    """What a setting may be: its choices, or its range."""
     annotation = info.annotation
     if get_origin(annotation) is Literal:
-        return [" or ".join(str(choice) for choice in get_args(annotation))]
-    words: list[str] = []
-    for mark in info.metadata:
-        for name, word in _BOUNDS.items():
-            if hasattr(mark, name):
-                words.append(f"{word} {getattr(mark, name)}")
-    return words
+        *others, last = map(str, get_args(annotation))
+        return [f"{', '.join(others)} or {last}"]
+    return [
+        f"{word} {getattr(mark, name)}"
+        for mark in info.metadata
+        for name, word in _BOUNDS.items()
+        if hasattr(mark, name)
+    ]
 
 
 def _show(value: Any) -> str:
@@ -111,4 +155,4 @@ def _show(value: Any) -> str:
         return "on" if value else "off"
     if isinstance(value, (tuple, list)):
         return " ".join(str(part) for part in value)
-    return "none" if value is None else str(value)
+    return str(value)

@@ -1,14 +1,41 @@
-"""What `list` and `show` print, as lines."""
+"""The verbs `list` and `show`: what there is, as lines."""
 
 import inspect
 from typing import Any
 
 from tabulate import tabulate
 
-from pacesetter.errors import UsageError
-from pacesetter.runs import RunDirectory, find_all
+from pacesetter.budget import budget, is_spent
+from pacesetter.cli.flags import add_runs, parser
+from pacesetter.errors import UsageError, unknown
+from pacesetter.runs import Row, RunDirectory, find, find_all
 
 SHOWN_EVALUATIONS = 5
+
+
+def list_(words: list[str]) -> int:
+    """List algorithms, envs, rules, presets, suites or runs."""
+    command = parser("list", "List algorithms, envs, rules, presets, suites or runs.")
+    nouns = [*LISTS, "runs"]
+    command.add_argument("noun", metavar="|".join(nouns), help="what to list")
+    add_runs(command)
+    found = command.parse(words)
+    if found.noun not in nouns:
+        raise unknown("list", found.noun, nouns)
+    for line in runs(found.runs) if found.noun == "runs" else LISTS[found.noun]():
+        print(line)
+    return 0
+
+
+def show(words: list[str]) -> int:
+    """Show a run: how far it is, how it scores, what it spent, its settings."""
+    command = parser("show", "Show a run: how far it is, how it scores, what it spent.")
+    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
+    add_runs(command)
+    found = command.parse(words)
+    for line in describe(find(found.run, found.runs)):
+        print(line)
+    return 0
 
 
 def algorithms() -> list[str]:
@@ -23,7 +50,7 @@ def algorithms() -> list[str]:
 
 
 def envs() -> list[str]:
-    """The walkers by id, and what else `train` takes."""
+    """Gymnasium's walkers by id, and what else `train` takes."""
     from pacesetter.envs import known
 
     walkers = ("HalfCheetah", "Walker2d", "Ant", "Humanoid", "Hopper", "Swimmer")
@@ -48,23 +75,30 @@ def presets() -> list[str]:
 
 
 def suites() -> list[str]:
-    """What `bench` ships, how many runs each is, and what it is for."""
+    """Suites that come with the package: how many runs each has, and what it is for."""
     from pacesetter.study.bench.suite import count, load, shipped
 
     found = [load(name) for name in shipped()]
     return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
 
 
+LISTS = {
+    "algorithms": algorithms,
+    "envs": envs,
+    "rules": rules,
+    "presets": presets,
+    "suites": suites,
+}
+
+
 def runs(folder: str) -> list[str]:
-    """Runs below a folder: how far each is and how its champion does."""
+    """Runs below a folder: how far each is and how its champion scores."""
     rows: list[tuple[Any, ...]] = []
     for run in find_all(folder):
         try:
-            step, budget, result = _state(run)
+            rows.append((run.path, *_state(run)))
         except (UsageError, KeyError, TypeError) as error:
             rows.append((run.path, "-", f"damaged or foreign: {error}", "-"))
-            continue
-        rows.append((run.path, f"{step:,} of {budget:,}", _status(run, step, budget), result))
     if not rows:
         return [f"no runs below {folder}"]
     return _table(rows, ("run", "steps", "state", "return"))
@@ -79,53 +113,48 @@ def describe(run: RunDirectory) -> list[str]:
 
 
 def _describe(run: RunDirectory) -> list[str]:
-    record = run.record()
-    step, budget, _ = _state(run)
-    rows = run.rows()
+    record, rows = run.record(), run.rows()
+    steps, state, _ = _state(run)
     evaluations = [row for row in rows if row["kind"] == "eval"]
-    selections = [row for row in rows if row["kind"] == "select"]
     recent = [
         (f"{row['step']:,}", f"{row['mean']:.1f}", f"{row['std']:.1f}", len(row["returns"]))
         for row in evaluations[-SHOWN_EVALUATIONS:]
     ]
-    last = rows[-1] if rows else {}
-    ledger = [
-        (key, last[key])
-        for key in ("member_steps", "selection_steps", "updates", "transitions", "episodes")
-        if key in last
-    ]
-    times = [(key, f"{last[key]:.0f}") for key in ("cpu_seconds", "wall_seconds") if key in last]
-    settings = [(key, value) for key, value in record["settings"].items()]
     made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
-    made += [(name, number) for name, number in record["versions"].items()]
     return [
-        f"{run.path}: {step:,} of {budget:,} steps, {_status(run, step, budget)}",
+        f"{run.path}: {steps} steps, {state}",
         "",
         *_table(recent, ("step", "return", "std", "episodes")),
         "",
-        *_table([*ledger, ("selections", len(selections)), *times]),
+        *_table(_ledger(rows)),
         "",
-        *_table(settings),
+        *_table(list(record["settings"].items())),
         "",
-        *_table(made),
+        *_table([*made, *record["versions"].items()]),
     ]
 
 
-def _state(run: RunDirectory) -> tuple[int, int, str]:
+def _ledger(rows: list[Row]) -> list[tuple[str, Any]]:
+    """What a run has spent, by the last row of its log."""
+    last = rows[-1] if rows else {}
+    counts = ("member_steps", "selection_steps", "updates", "transitions", "episodes")
+    times = ("cpu_seconds", "wall_seconds")
+    return [
+        *((key, last[key]) for key in counts if key in last),
+        ("selections", sum(row["kind"] == "select" for row in rows)),
+        *((key, f"{last[key]:.0f}") for key in times if key in last),
+    ]
+
+
+def _state(run: RunDirectory) -> tuple[str, str, str]:
+    """How far a run is, its state, and its last evaluation."""
     settings, rows = run.settings(), run.rows()
-    budget = settings["steps"] * (settings["members"] if settings["count"] == "member" else 1)
+    last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
+    over = is_spent(settings, last["step"], last["wall_seconds"])
+    state = "running" if run.in_use() else "finished" if over else "stopped"
     means = [row["mean"] for row in rows if row["kind"] == "eval"]
-    return (rows[-1]["step"] if rows else 0), budget, f"{means[-1]:.1f}" if means else "-"
-
-
-def _status(run: RunDirectory, step: int, budget: int) -> str:
-    if run.in_use():
-        return "running"
-    if step >= budget:
-        return "finished"
-    limit = run.settings()["time"]
-    late = limit is not None and any(row["wall_seconds"] >= limit for row in run.rows()[-1:])
-    return "finished" if late else "stopped"
+    steps = f"{last['step']:,} of {budget(settings):,}"
+    return steps, state, f"{means[-1]:.1f}" if means else "-"
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:

@@ -1,21 +1,55 @@
-"""Where reports go besides the log: a progress bar on a terminal, plain lines elsewhere."""
+"""Progress on stderr: bars on a terminal, plain lines elsewhere. Here, of one run."""
 
 import sys
 from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import timedelta
+from math import inf
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from pacesetter.training.trainer import Report, Trainer
 
 Sink = Callable[["Report"], None]
 
 
+class Pace:
+    """Steps per second over the last looks, and the time left at that speed."""
+
+    def __init__(self, step: int, seconds: float, looks: int) -> None:
+        self._marks = deque([(step, seconds)], maxlen=looks)
+
+    def read(self, step: int, seconds: float, total: int, most: float = inf) -> tuple[float, str]:
+        """Speed, and the time until `total` steps but `most` seconds; `-` before the first step."""
+        self._marks.append((step, seconds))
+        first_step, first_seconds = self._marks[0]
+        speed = (step - first_step) / max(seconds - first_seconds, 1e-9)
+        if speed <= 0:
+            return 0.0, "-"
+        left = min((total - step) / speed, max(most, 0.0))
+        return speed, str(timedelta(seconds=round(left)))
+
+
+def bars() -> "Progress":
+    """Bars on stderr: a name, how far it is, and a `note`."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
+        TextColumn("{task.fields[note]}"),
+    )
+    return Progress(*columns, console=Console(stderr=True), refresh_per_second=2)
+
+
 @contextmanager
 def console(trainer: "Trainer", quiet: bool = False) -> Generator[Sink]:
-    """A sink for reports: a bar with steps/s, ETA and last return, or a line an evaluation."""
+    """Show a run's reports: on a terminal as a bar, elsewhere as one line per evaluation."""
     if quiet:
         yield lambda report: None
     elif sys.stderr.isatty():
@@ -25,72 +59,44 @@ def console(trainer: "Trainer", quiet: bool = False) -> Generator[Sink]:
         yield _lines(trainer)
 
 
-class _Pace:
-    """Speed over the last reports and what is left of both budgets."""
+def _speed(trainer: "Trainer") -> Callable[["Report"], str]:
+    """What says a run's speed and the time left, by its budget of steps and of time."""
+    progress, limit = trainer.progress, trainer.config.run.time or inf
+    pace = Pace(progress.step, progress.wall_seconds, looks=10)
 
-    def __init__(self, trainer: "Trainer") -> None:
-        self.trainer = trainer
-        start = (trainer.progress.step, trainer.progress.wall_seconds)
-        self.marks = deque([start], maxlen=10)
-
-    def read(self, report: "Report") -> tuple[float, str]:
-        """Steps a second and the time left as text."""
+    def read(report: "Report") -> str:
         seconds = report.ledger["wall_seconds"]
-        self.marks.append((report.step, seconds))
-        first_step, first_seconds = self.marks[0]
-        speed = (report.step - first_step) / max(seconds - first_seconds, 1e-9)
-        left = (self.trainer.budget - report.step) / max(speed, 1e-9) if report.step else 0.0
-        limit = self.trainer.config.run.time
-        if limit is not None:
-            left = min(left, max(limit - seconds, 0.0))
-        known = report.step > first_step
-        return speed, str(timedelta(seconds=round(left))) if known else "-"
+        speed, left = pace.read(report.step, seconds, trainer.budget, limit - seconds)
+        return f"{speed:.0f} steps/s  ETA {left}"
+
+    return read
 
 
 def _lines(trainer: "Trainer") -> Sink:
-    pace = _Pace(trainer)
+    read = _speed(trainer)
 
     def show(report: "Report") -> None:
-        speed, left = pace.read(report)
+        speed = read(report)
         if report.kind == "eval":
-            values = report.values
-            print(
-                f"step {report.step:,}  return {values['mean']:.1f} +- {values['std']:.1f}  "
-                f"{speed:.0f} steps/s  ETA {left}",
-                file=sys.stderr,
-                flush=True,
-            )
+            result = f"return {report.values['mean']:.1f} +- {report.values['std']:.1f}"
+            line = f"step {report.step:,}  {result}  {speed}"
+            print(line, file=sys.stderr, flush=True)
 
     return show
 
 
 @contextmanager
 def _bar(trainer: "Trainer") -> Generator[Sink]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    pace, run = _Pace(trainer), trainer.config.run
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]} steps/s  ETA {task.fields[left]}"),
-        TextColumn("return {task.fields[result]}"),
-    )
-    with Progress(*columns, console=Console(stderr=True), refresh_per_second=2) as bar:
-        task = bar.add_task(
-            f"{run.env} {run.name} {run.seed}",
-            total=trainer.budget,
-            completed=trainer.progress.step,
-            speed="-",
-            left="-",
-            result="-",
-        )
+    read, run, result = _speed(trainer), trainer.config.run, "-"
+    with bars() as shown:
+        name, step = f"{run.env} {run.name} {run.seed}", trainer.progress.step
+        task = shown.add_task(name, total=trainer.budget, completed=step, note="")
 
         def show(report: "Report") -> None:
-            speed, left = pace.read(report)
-            bar.update(task, completed=report.step, speed=f"{speed:.0f}", left=left)
+            nonlocal result
             if report.kind == "eval":
-                bar.update(task, result=f"{report.values['mean']:.1f}")
+                result = f"{report.values['mean']:.1f}"
+            note = f"{read(report)}  return {result}"
+            shown.update(task, completed=report.step, note=note)
 
         yield show

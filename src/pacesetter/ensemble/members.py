@@ -57,8 +57,8 @@ class Ensemble:
         self.loss_names = self.population.loss_names(self.states[0])
         self.normalizer = Normalizer(spec.observation_size)
         self.unchanged = self.normalizer.statistics()
-        self.budget = run.steps * config.unit
-        self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
+        self.budget = config.budget
+        self.horizon = (hyper.replay_horizon or 0) * config.steps_per_count  # 0: no weights
         self.replays: list[Replay] = []
         self.workers = ThreadPoolExecutor(min(run.members, threads()))
         self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
@@ -71,7 +71,7 @@ class Ensemble:
         spare = generator(run.seed, Stream.ACT)
         self.memory = [self.algorithm.start_episode(acting, spare) for acting in self.acting]
         self.progress = Progress.of(run.members)
-        every = run.select_every * config.unit
+        every = run.select_every * config.steps_per_count
         self.progress.next_selection = (config.select_after // every + 1) * every
         self.trial_env: Environment | None = None
 

@@ -70,7 +70,7 @@ def on_trials(ensemble: Ensemble) -> Selection | None:
     config, progress = ensemble.config, ensemble.progress
     if progress.step < progress.next_selection or progress.step >= ensemble.budget:
         return None
-    every = config.run.select_every * config.unit
+    every = config.run.select_every * config.steps_per_count
     returns = [_trial(ensemble, k) for k in range(config.run.members)]
     progress.next_selection = (progress.step // every + 1) * every
     # A selection that the budget cut short decides nothing.

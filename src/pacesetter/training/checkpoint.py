@@ -13,7 +13,8 @@ from pacesetter.ensemble.progress import Progress
 from pacesetter.envs import Snapshot
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.policy import Policy
-from pacesetter.runs import RunDirectory, threads
+from pacesetter.process import threads
+from pacesetter.runs import RunDirectory
 from pacesetter.storage import Content
 from pacesetter.training.on_policy import Iterations
 from pacesetter.types import Arrays

@@ -57,7 +57,7 @@ class Iterations:
         self.source: AllSteps | LastRollout = source(config, self.layout)
         self.loss_names = self.population.loss_names(self.states[0], *self.source.shape())
         self.normalizer = Normalizer(spec.observation_size)
-        self.budget = run.steps
+        self.budget = config.budget
         self.pending: list[Pending] = []
         self.kept: list[Policy | None] = [None]  # nothing is assessed
         self.memory = [self.algorithm.start_episode(self.acting[0], rng) for rng in self.streams]

@@ -7,7 +7,8 @@ from typing import Any, Self
 
 import jax
 
-from pacesetter.config import read_file, settle
+from pacesetter.budget import out_of_time
+from pacesetter.config import read_file, resolve
 from pacesetter.ensemble.members import Ensemble
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
@@ -15,7 +16,8 @@ from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
-from pacesetter.runs import RunDirectory, find, versions
+from pacesetter.provenance import versions
+from pacesetter.runs import RunDirectory, find
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
@@ -53,7 +55,7 @@ class Trainer:
         `settings` are those of `pacesetter train ALGO ENV --help`; `config` is a file of them.
         """
         layers = [read_file(Path(config), algorithm)] if config else []
-        self.config = settle(algorithm, env, *layers, settings)
+        self.config = resolve(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
         prepare(self.config.run.device)
@@ -84,7 +86,7 @@ class Trainer:
         changed = {key: value for key, value in budgets.items() if value is not None}
         if changed:
             settings = self.config.settings() | changed
-            self.config = settle(self.config.run.algorithm, self.config.run.env, settings)
+            self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
         prepare(self.config.run.device)
         self._begin()
         self.directory.lock()
@@ -161,8 +163,7 @@ class Trainer:
     @property
     def finished(self) -> bool:
         """Whether the budget of steps, with the updates they owe, or of time is spent."""
-        limit = self.config.run.time
-        if limit is not None and self.progress.wall_seconds >= limit:
+        if out_of_time(vars(self.config.run), self.progress.wall_seconds):
             return True
         return self.progress.step >= self.budget and not self.ensemble.behind
 
@@ -214,7 +215,7 @@ class Trainer:
         # The last one waits for all updates that the budget's last steps owe.
         if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
             self._evaluate(ending)
-            every = self.config.run.eval_every * self.config.unit
+            every = self.config.run.eval_every * self.config.steps_per_count
             progress.last_evaluation = progress.step
             progress.next_evaluation = (progress.step // every + 1) * every
 

@@ -1,1 +1,1 @@
-"""Many runs: suites, their queue, and where they run."""
+"""Many runs: suites, the queue, and the executors that run them."""

@@ -1,4 +1,4 @@
-"""Where the commands of a bench run: on this machine's cores, on a Ray cluster, or on paper."""
+"""Run the commands of a bench on this machine's cores or on a Ray cluster, or print them."""
 
 import os
 import shlex
@@ -14,17 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.process import cores
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
 
 
-def cores() -> list[int]:
-    """Cores that this process may use."""
-    return sorted(os.sched_getaffinity(0))
-
-
 class Local:
-    """Processes on this machine, each pinned to a core, which is what two cores do most with."""
+    """Processes on this machine, each pinned to one core, which gives the most runs per hour."""
 
     def __init__(self, slots: int) -> None:
         self.slots, self._cores = slots, cores()
@@ -84,7 +80,7 @@ class Ray:
 
 
 def run_command(words: list[str], folder: str) -> tuple[int, str]:
-    """`pacesetter WORDS` in a folder; interrupted, as Ray cancels a task, it saves and ends."""
+    """Run `pacesetter WORDS` in a folder; save and end when Ray cancels the task."""
     # A cluster that was started in the background of a script ignores interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryFile() as output:
@@ -113,7 +109,7 @@ def _popen(words: list[str], output: Any, folder: str | None = None) -> subproce
 
 @contextmanager
 def _pinned(core: int) -> Generator[None]:
-    """What is started in here runs on one core for good, and from its first instruction."""
+    """Pin processes started in here to one core from their first instruction."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {core})
     try:
@@ -122,11 +118,11 @@ def _pinned(core: int) -> Generator[None]:
         os.sched_setaffinity(0, before)
 
 
-# On paper.
+# Printed.
 
 
 def commands(jobs: Iterable[Job]) -> list[str]:
-    """A line of shell a run, which begins or resumes it, whichever is due when it is called."""
+    """One shell line per run, which starts it or, if its folder is there, resumes it."""
     alone = " ".join(f"{name}={value}" for name, value in ALONE.items())
     program = f"{alone} exec {shlex.quote(sys.executable)} -m pacesetter"
     lines: list[str] = []
@@ -162,6 +158,6 @@ exit $code
 
 
 def slurm(name: str, jobs: list[Job]) -> str:
-    """A job array, a task a run; Slurm's notice before the time limit makes a run save."""
+    """A job array with one task per run; runs save when Slurm warns before the time limit."""
     lines = "\n".join(shlex.quote(line) for line in commands(jobs))
     return SLURM.format(name=Path(name).stem, last=len(jobs) - 1, commands=lines)

@@ -1,7 +1,7 @@
-"""Jobs to their end: each run a command of its own; finished ones are skipped, broken ones resumed.
+"""Run jobs to their end, each as its own command: skip finished ones, resume broken ones.
 
-What has been done is read from the runs' folders alone, so a bench that was stopped or killed is
-called again, and several may work on one folder: the lock of a run's folder decides who has it.
+Progress is read from the runs' folders alone. A bench that was stopped or killed is therefore
+started again, and several may work on one folder: the lock of a run's folder decides who has it.
 """
 
 import shlex
@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from pacesetter import storage
+from pacesetter.budget import is_spent
 from pacesetter.ensemble.progress import Progress
 from pacesetter.errors import UsageError
 from pacesetter.runs import IN_USE
@@ -19,7 +20,7 @@ from pacesetter.study.bench.suite import Job
 RETRIES = 2
 BAD_INPUT, SAVED = 2, (130, 143)  # exit codes of `train` and `resume`
 POLL = 0.2  # seconds
-ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread a run: results never depend on --jobs
+ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread per run: results never depend on --jobs
 
 
 class Outcome(NamedTuple):
@@ -47,19 +48,6 @@ class Executor(Protocol):
         ...
 
 
-def refuse_others(job: Job) -> None:
-    """Refuse a run that is in the job's folder with other settings."""
-    if not job.directory.config_file.exists():
-        return
-    old, new = job.directory.config().settings(), job.config.settings()
-    for key in new:
-        if old.get(key) != new[key]:
-            raise UsageError(
-                f"run: {job.directory.path} exists with {key}={old.get(key)}, not {new[key]}; "
-                "give other --runs, or the entry another name"
-            )
-
-
 def is_finished(job: Job) -> bool:
     """Whether the newest checkpoint has spent the job's budget and been evaluated there."""
     try:
@@ -67,14 +55,12 @@ def is_finished(job: Job) -> bool:
         progress = Progress.load(table["progress"])
     except (UsageError, *storage.FAULTS):
         return False  # nothing yet, or damaged, which `resume` deals with
-    run = job.config.run
-    spent = progress.step >= run.steps * job.config.unit
-    late = run.time is not None and progress.wall_seconds >= run.time
-    return (spent or late) and progress.last_evaluation == progress.step
+    spent = is_spent(vars(job.config.run), progress.step, progress.wall_seconds)
+    return spent and progress.last_evaluation == progress.step
 
 
 def words_of(job: Job) -> list[str]:
-    """What brings a run further: `resume` if its folder holds one, else `train`."""
+    """The command that continues a run: `resume` if its folder holds one, else `train`."""
     if job.directory.config_file.exists():
         return ["resume", str(job.directory.path), "-q"]
     return [*job.words, "-q"]
@@ -85,7 +71,11 @@ class Bench:
 
     def __init__(self, jobs: list[Job]) -> None:
         for job in jobs:
-            refuse_others(job)
+            if found := job.directory.difference_from(job.config):
+                raise UsageError(
+                    f"run: {job.directory.path} exists with {found}; "
+                    "give other --runs, or the entry another name"
+                )
         self.jobs = jobs
         done = [is_finished(job) for job in jobs]
         self.finished = [job for job, over in zip(jobs, done, strict=True) if over]
@@ -111,7 +101,7 @@ class Bench:
             make(job.config.run.env, job.config.run.env_kwargs).close()
 
     def run(self, executor: Executor) -> Iterator[None]:
-        """Until all have finished or failed, or have saved after `stop`; yields at every look."""
+        """Run until all have finished, failed or, after `stop`, saved; yields at each poll."""
         stopped = False
         try:
             while self._waiting or self.running:
@@ -177,7 +167,7 @@ class Bench:
         self._waiting.append(job)
         if str(job) not in self._aside:
             self._aside.add(str(job))
-            self.news.append(f"{job}: another process has it; looked at again when it is free")
+            self.news.append(f"{job}: another process has it; will retry when it is free")
 
     def _finish(self, job: Job) -> None:
         self.finished.append(job)

@@ -1,4 +1,4 @@
-"""What to run: entries x envs x seeds of a suite file, or of flags, as one checked job a run."""
+"""What to run: entries x envs x seeds of a suite file, or of flags, as one checked job per run."""
 
 import json
 from collections.abc import Iterable
@@ -6,14 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, read_file, settle
+from pacesetter.config import Config, read_file, resolve
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
 
 FOLDER = Path(__file__).with_name("suites")
 MOST_SEEDS = 10_000
-TUNING_SEEDS = 2**31  # those of `tune` start here, those of `bench` end here: none is both
+TUNING_SEEDS = 2**31  # seeds of `tune` start here and seeds of `bench` end here, so none is both
 DECIDED = ("algorithm", "env", "name", "seed")
 
 
@@ -60,7 +60,7 @@ def load(name: str) -> Suite:
             raise UsageError(f"suite: {path}: entries.{name} must be a table")
         if not isinstance(entry.get("algorithm", name), str):
             raise UsageError(f"suite: {path}: entries.{name}: algorithm must be a name")
-    named = {name: _plain(entry) for name, entry in entries.items()}
+    named = {name: _with_underscores(entry) for name, entry in entries.items()}
     return Suite(path.stem, str(about), table, named, path.parent)
 
 
@@ -79,7 +79,7 @@ def pick(suite: Suite, names: Iterable[str]) -> Suite:
 
 
 def count(suite: Suite) -> int:
-    """How many runs it is, without looking at their settings."""
+    """The number of runs, without a look at their settings."""
     tables = [suite.shared | entry for entry in suite.entries.values()]
     return sum(len(_envs(t.get("envs"))) * len(_seeds(t.get("seeds", 1))) for t in tables)
 
@@ -88,25 +88,27 @@ def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
     """Every run, the first seed of all entries first; flags win over what the suite says."""
     jobs: list[Job] = []
     for name, entry in suite.entries.items():
-        said = suite.shared | entry | flags
+        merged = suite.shared | entry | flags
         try:
-            for env in _envs(said.get("envs")):
-                below = _file(suite, said.get("config"), env)
+            for env in _envs(merged.get("envs")):
+                below = _file(suite, merged.get("config"), env)
                 own = {**suite.shared, **below, **entry, **flags}
-                jobs += _jobs(name, env, _seeds(said.get("seeds", 1)), own, runs)
+                jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
-def _jobs(name: str, env: str, seeds: list[int], said: Settings, runs: str | Path) -> Iterable[Job]:
-    own = {key: value for key, value in said.items() if key not in ("envs", "seeds", "config")}
+def _jobs(
+    name: str, env: str, seeds: list[int], given: Settings, runs: str | Path
+) -> Iterable[Job]:
+    own = {key: value for key, value in given.items() if key not in ("envs", "seeds", "config")}
     algorithm = own.pop("algorithm", name)
     for key in DECIDED:
         if key in own:
-            raise UsageError(f"{key}: is for the entry's name, envs and seeds to say")
-    run, hyper = settle(algorithm, env, own, {"name": name})
-    usual = settle(algorithm, env).settings()
+            raise UsageError(f"{key}: cannot be set here; the entry's name, envs and seeds set it")
+    run, hyper = resolve(algorithm, env, own, {"name": name})
+    usual = resolve(algorithm, env).settings()
     differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
     for seed in seeds:
         config = Config(replace(run, seed=seed), hyper)
@@ -115,7 +117,7 @@ def _jobs(name: str, env: str, seeds: list[int], said: Settings, runs: str | Pat
 
 
 def _flags(settings: Settings) -> Iterable[str]:
-    """Settings as `train` takes them from a command line."""
+    """Settings as flags of `train`."""
     for key, value in settings.items():
         flag = key.replace("_", "-")
         if key == "env_kwargs":
@@ -125,7 +127,7 @@ def _flags(settings: Settings) -> Iterable[str]:
         elif isinstance(value, (tuple, list)):
             yield from (f"--{flag}", *map(str, value))
         elif value is None:
-            raise UsageError(f"{key}: cannot be taken back to none")
+            raise UsageError(f"{key}: has a value in the preset and cannot be unset")
         else:
             yield f"--{flag}={value}"
 
@@ -142,7 +144,7 @@ def _seeds(value: Any) -> list[int]:
     if not whole or not seeds:
         raise UsageError(f"seeds: must be how many, or a list of them, got {value!r}")
     if not all(0 <= seed < TUNING_SEEDS for seed in seeds):
-        raise UsageError(f"seeds: must be from 0 to {TUNING_SEEDS - 1}; above are those of `tune`")
+        raise UsageError(f"seeds: must be from 0 to {TUNING_SEEDS - 1}; `tune` uses those above")
     return list(dict.fromkeys(seeds))
 
 
@@ -151,10 +153,10 @@ def _file(suite: Suite, file: Any, env: str) -> Settings:
     if file is None:
         return {}
     if not isinstance(file, str):
-        raise UsageError(f"config: must be the path of a file, it is {file!r}")
+        raise UsageError(f"config: must be the path of a file, got {file!r}")
     table = read_file(suite.folder / file.replace("{env}", env.replace("/", "-")))
     return {key: value for key, value in table.items() if key not in DECIDED}
 
 
-def _plain(table: Settings) -> Settings:
+def _with_underscores(table: Settings) -> Settings:
     return {key.replace("-", "_"): value for key, value in table.items()}

@@ -1,1 +1,1 @@
-"""Runs read, grouped and compared."""
+"""Read, group and compare runs."""

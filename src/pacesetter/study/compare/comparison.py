@@ -1,4 +1,4 @@
-"""Runs grouped for a comparison: which belong side by side, and what has to be said of them."""
+"""Runs grouped for a comparison: which may be compared, and what a reader must be told."""
 
 import re
 from collections import Counter, defaultdict
@@ -12,22 +12,24 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked
 
-from pacesetter.config import build
 from pacesetter.errors import UsageError, unknown
+from pacesetter.runs import FREE_PER_SEED
 from pacesetter.settings import STRICT, Count, Duration
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.results import Run, gather
 from pacesetter.study.compare.stats import Array
+from pacesetter.validation import build
 
 METRICS = {
     "final": "mean of the evaluations in the last 10% of the budget, and of at least three",
-    "auc": "area under the curve of evaluations, over the env steps it spans",
+    "auc": "area under the curve of evaluations, divided by the env steps it spans",
     "max": "largest evaluation after the first update; inflated, as a maximum of noisy values is",
 }
 CONTROL = "td3"
 ANT = "pacesetter/Ant111"
-# A seed's runs may differ in these without being another group.
-_FREE = {"seed", "steps", "time", "checkpoint_every", "device"}
+# Seeds of one name may differ in these. `train` also lets the horizon follow from --steps, but
+# weights that are annealed at another speed are another algorithm, of which a table must tell.
+_FREE = FREE_PER_SEED - {"replay_horizon"}
 _SPENT = ("steps", "updates", "transitions", "cpu", "wall")
 
 
@@ -75,7 +77,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is compared, by which metric, against whom, and what a reader must be told."""
+    """The groups, the metric, the control, and what a reader must be told."""
 
     groups: list[Group]
     metric: str
@@ -124,7 +126,7 @@ def compare(
     if metric not in METRICS:
         raise unknown("metric", metric, METRICS)
     if budget is not None and cpu is not None:
-        raise UsageError("cpu: cuts runs at another place than --budget; give one of them")
+        raise UsageError("cpu: limits runs otherwise than --budget does; give one of the two")
     limit = build(Limit, {"budget": budget, "cpu": cpu})
     found, empty = gather(runs, below)
     kept, notes = _complete(found, empty, limit)
@@ -167,7 +169,7 @@ def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Ru
             kept.append(run)
     if not kept:
         reason = f": {'; '.join(out[:3])}" if out else ""
-        raise UsageError(f"run: none is complete{reason}; cut all with --budget, or resume them")
+        raise UsageError(f"run: none is complete{reason}; limit all with --budget, or resume them")
     return kept, [f"Left out as incomplete: {', '.join(out)}."] if out else []
 
 
@@ -194,38 +196,38 @@ def _refuse_twins(runs: list[Run]) -> None:
 
 def _mixtures(runs: list[Run], mixed: bool, limit: Limit) -> list[str]:
     """Refuse several versions of a task, several budgets, or settings that differ in a group."""
-    said: list[str] = []
+    faults: list[str] = []
     versions: dict[str, set[str]] = defaultdict(set)
     for run in runs:
         versions[split(run.env)[0]].add(split(run.env)[1])
     for task, several in versions.items():
         if len(several) > 1:
-            said.append(f"env: {task} in the versions {', '.join(sorted(several))}")
+            faults.append(f"env: {task} in the versions {', '.join(sorted(several))}")
     budgets = sorted({run.budget for run in runs})
     if len(budgets) > 1 and not limit.cpu:
         shown = ", ".join(f"{budget:,}" for budget in budgets)
-        said.append(f"budget: runs of {shown} env steps; --budget cuts all at one")
-    said += _differing(runs)
-    if said and not mixed:
-        raise UsageError(f"{'; '.join(said)}; --mixed compares them all the same and says so")
-    return [f"Mixed, so no fair comparison: {line}." for line in said]
+        faults.append(f"budget: runs of {shown} env steps; --budget limits all to one")
+    faults += _differing(runs)
+    if faults and not mixed:
+        raise UsageError(f"{'; '.join(faults)}; --mixed compares them anyway and says so")
+    return [f"Mixed, so no fair comparison: {line}." for line in faults]
 
 
 def _differing(runs: list[Run]) -> list[str]:
     first: dict[tuple[str, str], Run] = {}
-    said: dict[tuple[str, str, str], str] = {}
+    faults: dict[tuple[str, str, str], str] = {}
     for run in runs:
         other = first.setdefault((run.env, run.name), run)
         # A setting that an older version did not have is not a difference.
         for key in sorted((run.settings.keys() & other.settings.keys()) - _FREE):
             a, b = other.settings[key], run.settings[key]
             if a != b:
-                said[run.env, run.name, key] = f"{run.env} {run.name} has {key} {a} and {b}"
-    return list(said.values())
+                faults[run.env, run.name, key] = f"{run.env} {run.name} has {key} {a} and {b}"
+    return list(faults.values())
 
 
 def _remarks(groups: list[Group], limit: Limit) -> list[str]:
-    """What is no reason to refuse, but to be told."""
+    """Notes on what is no reason to refuse."""
     runs = [run for group in groups for run in group.runs]
     notes: list[str] = []
     few = [

@@ -1,4 +1,4 @@
-"""Selections of a run: how sure each was, and who descends from whom."""
+"""Selections of a run: how certain each was, and which member descends from which."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -87,7 +87,7 @@ def shorten(line: list[int], most: int = 12) -> str:
 def diagram(found: Selections, width: int = 3, height: int = 22) -> tuple[str, str, int, int]:
     """SVG paths of all copies and of the champion's line, and the size they need.
 
-    Time goes right, one selection after another; each member has a height of its own.
+    Time goes right, one selection after another; each member has its own height.
     """
     count, members = found.parents.shape
     every = [

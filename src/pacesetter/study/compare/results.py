@@ -1,4 +1,4 @@
-"""A run as its results: what is read from a run directory, or from a line of results/*.jsonl."""
+"""Results of one run, read from its folder or from a line of results/*.jsonl."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pacesetter.budget import budget, is_spent, steps_per_count
 from pacesetter.errors import UsageError
 from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all
 from pacesetter.study.compare import stats
@@ -25,7 +26,7 @@ AXES = {
 PROVENANCE = ("command", "versions", "commit", "threads", "machine")
 SELECTION = ("step", "gap", "standard_error", "parents", "champion")
 DECIMALS = 3  # of a return in a line of results
-# Numbers of an evaluation's row that are no expense; what else is there, an algorithm counts.
+# Numbers in an evaluation's row that are not spent; the others are counts of an algorithm.
 _NOT_SPENT = {"mean", "std", "champion", "episodes", *COLUMNS}
 
 
@@ -68,20 +69,16 @@ class Run:
     @cached_property
     def clock(self) -> Array:
         """Steps at which the evaluations were due (N,); they come at the next tick's end."""
-        every = self.settings["eval_every"] * self._unit
+        every = self.settings["eval_every"] * steps_per_count(self.settings)
         due = self.steps // every * every
         again = np.diff(due, prepend=-1) == 0  # the one at the end of an odd budget
         ended = self.steps >= self.planned
         return np.where(ended, self.planned, np.where(again, self.steps, due))
 
     @property
-    def _unit(self) -> int:
-        return self.settings["members"] if self.settings["count"] == "member" else 1
-
-    @property
     def planned(self) -> int:
         """Env steps the run was to make."""
-        return self.settings["steps"] * self._unit
+        return budget(self.settings)
 
     @property
     def budget(self) -> int:
@@ -90,8 +87,7 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        limit = self.settings.get("time")
-        return self.clock[-1] >= self.planned or (limit is not None and self.wall[-1] >= limit)
+        return is_spent(self.settings, self.clock[-1], self.wall[-1])
 
     def cut(self, budget: int) -> "Run":
         """The run as it was at a budget."""
@@ -99,7 +95,8 @@ class Run:
         names = ("steps", "returns", "updates", "transitions", "cpu", "wall")
         cut: dict[str, Any] = {name: getattr(self, name)[kept] for name in names}
         cut["extra"] = {name: values[kept] for name, values in self.extra.items()}
-        settings = self.settings | {"steps": min(budget, self.planned) // self._unit}
+        steps = min(budget, self.planned) // steps_per_count(self.settings)
+        settings = self.settings | {"steps": steps}
         return replace(self, **cut, table=self.table | {"settings": settings})
 
     def within(self, cpu: float) -> "Run":
@@ -216,7 +213,7 @@ def _directories(word: str, runs: Path) -> list[RunDirectory]:
         below = [run for path in sorted(glob(word)) for run in find_all(path)]
         below += [run for run in find_all(runs) if _fits(run.path, word)]
         if not below:
-            raise UsageError(f"run: '{word}' fits no run here or below {runs}")
+            raise UsageError(f"run: '{word}' matches no run here or below {runs}")
         return below
     groups = [run for run in find_all(runs) if run.path.parent.match(word)]
     return groups or [find(word, runs)]

@@ -40,7 +40,7 @@ def ledger(groups: Sequence[Group], factor: int = 1) -> Table:
 
 
 def overview(comparison: Comparison) -> Table:
-    """The metric, one row an algorithm and one column a task; each cell says version and seeds."""
+    """The metric, one row per algorithm, one column per task; each cell names version and seeds."""
     metric = comparison.metric
     rows: list[list[Cell]] = []
     for name in comparison.names:
@@ -98,7 +98,7 @@ def details(comparison: Comparison) -> Table:
 
 
 def speed(comparison: Comparison) -> Table:
-    """How soon rewards come, and what a step costs."""
+    """How many env steps a return takes, and what a step costs."""
     rows: list[list[Cell]] = []
     for group in comparison.groups:
         row = [word(group.env), word(group.name), number(len(group.runs))]
@@ -147,7 +147,7 @@ def _dirty(commit: str | None) -> str:
 
 
 def made_with(comparison: Comparison) -> list[str]:
-    """Versions and machines of the runs, one line each combination."""
+    """Versions and machines of the runs, one line per combination."""
     lines = [
         ", ".join(f"{name} {number}" for name, number in run.table["versions"].items())
         + f"; {run.table['machine']}, {run.table['threads']} threads"

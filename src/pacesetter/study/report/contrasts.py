@@ -35,7 +35,7 @@ def against(comparison: Comparison) -> list[Table]:
         f"Difference of the mean {metric} return with Welch's 95% t interval; P(better): chance "
         f"that a run of the algorithm beats one of {comparison.reference}.",
         "Seeds: for each side, to see that gap with 80% power in a two-sided t test at 5%, if the "
-        "deviations of these runs are right.",
+        "standard deviations of these runs are right.",
     ]
     return [Table(f"Against {comparison.reference}", headers, rows, notes, ledger(used))]
 
@@ -68,7 +68,7 @@ def shared(comparison: Comparison) -> dict[str, list[Array]]:
 
 
 def together(comparison: Comparison) -> list[Table]:
-    """All shared tasks in one number an algorithm."""
+    """All shared tasks in one number per algorithm."""
     scores = shared(comparison)
     control = scores.get(comparison.reference)
     rows: list[list[Cell]] = []
@@ -87,13 +87,13 @@ def together(comparison: Comparison) -> list[Table]:
     notes = [
         f"Score: {comparison.metric} return over the published return of TD3 on that task after 1M "
         "steps (published.toml), only to bring tasks to one scale; it is of other env versions.",
-        "Stratified bootstrap over the runs of each task, from ten seeds a task on.",
+        "Stratified bootstrap over the runs of each task, from ten seeds per task on.",
     ]
     return [Table("All tasks together", headers, rows, notes, ledger(comparison.groups))]
 
 
 def best_of_two(comparison: Comparison) -> list[Table]:
-    """What picking the better of two independent control runs afterwards would have given."""
+    """What the better of two independent control runs, picked afterwards, would have scored."""
     rows: list[list[Cell]] = []
     used: list[Group] = []
     for env in comparison.envs:

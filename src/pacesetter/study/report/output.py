@@ -28,7 +28,7 @@ def check(paths: list[str], options: Options) -> list[Path]:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"-o: {path} must end in {', '.join(SUFFIXES)}")
         if not path.parent.is_dir():
-            raise UsageError(f"-o: {path.parent} is no folder")
+            raise UsageError(f"-o: {path.parent} is not a folder")
     if options.smooth is not None and (
         options.smooth <= SMOOTHING_ORDER or options.smooth % 2 == 0
     ):

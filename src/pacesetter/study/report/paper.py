@@ -41,8 +41,8 @@ def paper_table(comparison: Comparison, which: str) -> Table | None:
         f"Ours, final: {METRICS['final']}. Ours, max: {METRICS['max']}. It is the paper's kind of "
         "number, and the final return is ours.",
         "The paper's budget is ambiguous (its tables say episodes, its figure time steps), and so "
-        "is what its deviation is over. Rows of different env versions, budgets or metrics are "
-        "not measured on the same thing.",
+        "is what its standard deviation is over. Rows of different env versions, budgets or "
+        "metrics do not measure the same thing.",
     ]
     title = f"The paper's table {which}"
     return Table(title, ["algorithm", "source", *TASKS], rows, notes, ledger(groups))
@@ -117,7 +117,8 @@ def published(comparison: Comparison) -> Table | None:
     notes = [
         "Published numbers with the env version, budget and metric of their source. Only "
         "HalfCheetah has the same dynamics from v2 to v5; a maximum is inflated, a training return "
-        "has noise in it, and a deviation over episodes of one agent says nothing of seeds."
+        "has noise in it, and a standard deviation over episodes of one agent says nothing about "
+        "seeds."
     ]
     rows = sorted(rows, key=lambda row: (row[0].text, row[6].text != "ours"))
     return Table("Published returns", headers, rows, notes, ledger(used))

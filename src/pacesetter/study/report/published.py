@@ -14,7 +14,7 @@ def _file() -> dict[str, Any]:
 
 
 def sources() -> list[Source]:
-    """All sources, with their returns as {task: [mean, deviation]} or [mean] alone."""
+    """All sources, with their returns as {task: [mean, standard deviation]} or [mean] alone."""
     return _file()["source"]
 
 

@@ -1,4 +1,4 @@
-"""A study's files: Optuna's journal, what it searches, and locks that end with their holder."""
+"""Files of a study: Optuna's journal, the ranges it searches, and locks that end with a process."""
 
 import fcntl
 import json
@@ -10,6 +10,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.settings import Settings, Tune
+from pacesetter.validation import difference, fields_of
 
 try:
     import optuna
@@ -21,17 +22,17 @@ Ranges = dict[str, Tune]
 
 
 def ranges(hyper: type, fixed: Settings) -> Ranges:
-    """What is searched: the settings that declare a range and are not fixed."""
+    """The settings to search: those that declare a range and are not fixed."""
     return {
         name: mark
-        for name, info in vars(hyper)["__pydantic_fields__"].items()
+        for name, info in fields_of(hyper).items()
         for mark in info.metadata
         if isinstance(mark, Tune) and name not in fixed
     }
 
 
 def distribution(range_: Tune) -> Any:
-    """A range as Optuna has it."""
+    """A range as Optuna's distribution."""
     low, high, log = range_
     if isinstance(low, bool):
         return optuna.distributions.CategoricalDistribution([low, high])
@@ -41,9 +42,10 @@ def distribution(range_: Tune) -> Any:
 
 
 def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) -> optuna.Study:
-    """A new study, which begins with the settings as they are, or one of the same that is there.
+    """Open a study, or make one whose first trial has the default settings.
 
-    A trial is given up if it is behind the median after `patience` reports.
+    A trial is pruned if it is below the median after `patience` reports. Raises UsageError if the
+    file holds a study with other settings.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     study = optuna.create_study(
@@ -61,25 +63,22 @@ def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) 
         usual = {name: settings[name] for name in searched}
         study.enqueue_trial({k: v for k, v in usual.items() if searched[k].has(v)})
         return study
-    for key in {**old, **new}:
-        if old.get(key) != new.get(key):
-            raise UsageError(
-                f"study: {file} has {key}={old.get(key)}, not {new.get(key)}; give another --study"
-            )
+    if found := difference(old, new, {**old, **new}):
+        raise UsageError(f"study: {file} has {found}; give another --study")
     return study
 
 
 def refuse_foreign(file: Path) -> None:
-    """Refuse a file that is no journal, onto which Optuna would write all the same."""
+    """Refuse a file that is not a journal, to which Optuna would write all the same."""
     try:
         with file.open() as lines:
             line = lines.readline()
         if line and "op_code" not in json.loads(line):
-            raise ValueError("no journal of Optuna")
+            raise ValueError("not a journal of Optuna")
     except FileNotFoundError:
         pass
     except (OSError, ValueError, TypeError) as error:
-        raise UsageError(f"study: {file} is no study: {error}") from None
+        raise UsageError(f"study: {file} is not a study: {error}") from None
 
 
 def hold(path: Path) -> TextIOWrapper | None:
@@ -95,7 +94,7 @@ def hold(path: Path) -> TextIOWrapper | None:
 
 @contextmanager
 def alone(path: Path) -> Generator[None]:
-    """One process at a time is in here."""
+    """Let one process at a time into the block."""
     with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

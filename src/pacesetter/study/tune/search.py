@@ -1,12 +1,14 @@
 """Search settings with Optuna: a trial is a run, and a study's file is shared by its workers.
 
-A trial belongs to the process that holds its lock. One whose worker died is taken up by whoever
-looks next and goes on from its checkpoint, so no heartbeat is needed.
+A trial belongs to the process that holds its lock. If a worker dies, the next worker to look
+resumes its trial from the checkpoint, so no heartbeat is needed.
 """
 
 import json
 import shutil
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,7 @@ import jax
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.cli.progress import Sink, console
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
@@ -32,12 +33,15 @@ from pacesetter.study.tune.journal import (
     ranges,
     refuse_foreign,
 )
-from pacesetter.training.trainer import Trainer
+from pacesetter.training.trainer import Report, Trainer
 
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
 PRUNED, FAILED = optuna.trial.TrialState.PRUNED, optuna.trial.TrialState.FAIL
-SAID = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
-LAST = 3  # evaluations that make a score, or a tenth of all
+OUTCOME = {COMPLETE: "return", PRUNED: "pruned at", FAILED: "failed:"}
+FEWEST = 3  # evaluations behind a score, or a tenth of all if that is more
+
+Sink = Callable[[Report], None]
+Show = Callable[[Trainer], AbstractContextManager[Sink]]  # opens what shows a trial's reports
 
 
 class Tuning:
@@ -47,7 +51,7 @@ class Tuning:
         self, algorithm: str, env: str, fixed: Settings, trials: int, file: str | Path
     ) -> None:
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
-        self.config, self.file = settle(algorithm, env, fixed), Path(file)
+        self.config, self.file = resolve(algorithm, env, fixed), Path(file)
         self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
         self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
@@ -71,9 +75,9 @@ class Tuning:
             raise UsageError(f"trials: must be at least 1, got {self.trials}")
         for key in ("seed", "name"):
             if key in self.fixed:
-                raise UsageError(f"{key}: trials have their own; seeds start at {TUNING_SEEDS}")
+                raise UsageError(f"{key}: each trial sets its own; seeds start at {TUNING_SEEDS}")
         if not self.ranges:
-            raise UsageError("tune: no setting is left to search; each is given or has no range")
+            raise UsageError("tune: no setting is left to search; all are fixed or have no range")
         if not self.file.name or self.file.is_dir():
             raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
         refuse_foreign(self.file)
@@ -91,12 +95,12 @@ class Tuning:
         trials = self.study.get_trials(deepcopy=False)
         return sum(trial.state.is_finished() for trial in trials) >= self.trials
 
-    def run(self, quiet: bool = False) -> None:
-        """Make trials until all have ended or other workers are at them."""
+    def run(self, show: Show) -> None:
+        """Make trials until all have ended or other workers have them; `show` shows each one."""
         while not self._stopping and (claim := self._claim()):
             trial, lock = claim
             with lock:
-                self._try(trial, quiet)
+                self._try(trial, show)
             jax.clear_caches()  # each trial compiles programs of its own
 
     def summary(self) -> str:
@@ -127,11 +131,11 @@ class Tuning:
             assert lock is not None
             return trial, lock
 
-    def _try(self, trial: optuna.Trial, quiet: bool) -> None:
-        """Train one to its end, its pruning, a fault, or `stop`, which leaves it open."""
+    def _try(self, trial: optuna.Trial, show: Show) -> None:
+        """Train one trial until it ends, is pruned or fails; `stop` leaves it open."""
         try:
             self._trainer = trainer = self._trainer_of(trial)
-            with console(trainer, quiet) as sink:
+            with show(trainer) as sink:
                 pruned = self._train(trial, trainer, sink)
         except (TrainingError, UsageError) as error:
             self._tell(trial, FAILED, None, str(error))
@@ -147,7 +151,7 @@ class Tuning:
         if self._stopping:
             trainer.stop()
         told = self.study.get_trials(deepcopy=False)[trial.number].intermediate_values
-        every = self.config.run.eval_every * self.config.unit
+        every = self.config.run.eval_every * self.config.steps_per_count
         for report in trainer:
             sink(report)
             number = report.step // every
@@ -162,7 +166,7 @@ class Tuning:
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
         given: Settings = {**self.fixed, **trial.params}
         given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
-        config = settle(self.algorithm, self.env, given)
+        config = resolve(self.algorithm, self.env, given)
         directory = RunDirectory.of(self.runs, config)
         if not directory.config_file.exists():
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
@@ -182,7 +186,7 @@ class Tuning:
                 text = f"{text}, best {best.value:.1f} in trial {best.number}"
                 write_atomically(self.best_file, self._best_toml(best).encode())
         print(
-            f"trial {trial.number} of {self.trials}: {SAID[state]} {text}",
+            f"trial {trial.number} of {self.trials}: {OUTCOME[state]} {text}",
             file=sys.stderr,
             flush=True,
         )
@@ -201,9 +205,9 @@ class Tuning:
 
 
 def _score(rows: list[Row]) -> float:
-    """Mean return of the last evaluations, a tenth of them or LAST; that of step 0 never counts."""
+    """Mean return of the last evaluations, a tenth of all or FEWEST; step 0 never counts."""
     means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
-    return float(np.mean(means[-max(LAST, len(means) // 10) :]))
+    return float(np.mean(means[-max(FEWEST, len(means) // 10) :]))
 
 
 def _toml(value: Any) -> str:

@@ -1,0 +1,141 @@
+"""The verb `bench`."""
+
+import argparse
+import shlex
+import sys
+from typing import Any
+
+from pacesetter.cli.flags import (
+    Parser,
+    add_env_keywords,
+    add_quiet,
+    add_runs,
+    add_settings,
+    parser,
+    split_env_kwargs,
+)
+from pacesetter.config import Run, preset_layers
+from pacesetter.errors import UsageError
+from pacesetter.process import cores, exit_code, stopping
+from pacesetter.settings import Settings
+from pacesetter.study.bench import suite as suites
+from pacesetter.study.bench.suite import Suite
+
+OWN = ("algos", "jobs", "executor", "address", "print", "runs", "quiet", "env.KEY")
+
+
+def bench(words: list[str]) -> int:
+    """Train every algorithm on every env with every seed; skip what is done."""
+    suite, flags, own = _parse(words)
+    jobs = suites.expand(suite, flags, own["runs"])
+    if own["print"]:
+        return _print(suite, jobs, own["print"])
+    return _work(jobs, own, words)
+
+
+def _parse(words: list[str]) -> tuple[Suite, Settings, dict[str, Any]]:
+    """The suite, the settings laid over it, and the flags of `bench` itself."""
+    name = words[0] if words and not words[0].startswith("-") else None
+    command = _parser(name)
+    rest, env_kwargs = split_env_kwargs(words[1:] if name else words)
+    first, _ = command.parse_known_args([word for word in rest if word not in ("-h", "--help")])
+    suite = _suite(name, first.algos) if name or first.algos else None
+    if suite is not None:
+        _add_settings_of(suite, command)
+    found = vars(command.parse(rest))
+    if suite is None:
+        raise UsageError(f"bench: name a suite ({', '.join(suites.shipped())}) or give --algos")
+    flags: Settings = {key: value for key, value in found.items() if key not in OWN}
+    if env_kwargs:
+        flags["env_kwargs"] = env_kwargs
+    if len(seeds := flags.get("seeds", [])) == 1:
+        flags["seeds"] = seeds[0]
+    return suite, flags, {key: found[key] for key in OWN}
+
+
+def _parser(name: str | None) -> Parser:
+    command = parser("bench", "Run a suite, or --algos on --envs. Run it again to continue.")
+    if name is not None:
+        command.prog = f"pacesetter bench {name}"
+    words = "" if name else " [SUITE|FILE.toml]"
+    command.usage = f"{command.prog}{words} [--algos ...] [--envs ...] [--SETTING VALUE ...]"
+    command.epilog = (
+        f"Suites: {', '.join(suites.shipped())}. Every setting of `train` is a flag too; "
+        "`bench SUITE --help` lists them."
+    )
+    add, absent = command.add_argument, argparse.SUPPRESS
+    add("--algos", nargs="+", metavar="ALGO", help="algorithms to run, or entries of the suite")
+    add("--envs", nargs="+", metavar="ENV", default=absent, help="tasks, for all entries")
+    add("--seeds", nargs="+", type=int, metavar="N", default=absent, help="how many, or which ones")
+    jobs = "runs at once (default one per core, pinned to it)"
+    add("--jobs", type=int, metavar="N", help=jobs)
+    executor = "run here or on a Ray cluster (default local)"
+    add("--executor", choices=("local", "ray"), default="local", help=executor)
+    address = "address of a running Ray cluster, such as auto (default a new one)"
+    add("--address", metavar="A", help=address)
+    add("--print", choices=("commands", "slurm"), help="print the remaining runs, start none")
+    add_runs(command)
+    add_quiet(command)
+    return command
+
+
+def _suite(name: str | None, algos: list[str] | None) -> Suite:
+    if name is None:
+        return suites.of_algorithms(algos or [])
+    suite = suites.load(name)
+    return suites.pick(suite, algos) if algos else suite
+
+
+def _add_settings_of(suite: Suite, command: Parser) -> None:
+    from pacesetter import algorithms
+
+    add_settings(command, "settings of all runs", Run, None)
+    names = [entry.get("algorithm", name) for name, entry in suite.entries.items()]
+    for base in dict.fromkeys(preset_layers(name, "")[0] for name in names):
+        add_settings(command, f"settings of {base}", algorithms.find(base).Hyper, None)
+    add_env_keywords(command)
+
+
+def _print(suite: Suite, jobs: list[suites.Job], form: str) -> int:
+    from pacesetter.study.bench.executors import commands, slurm
+    from pacesetter.study.bench.queue import Bench
+
+    left = Bench(jobs).left
+    if left:
+        print(slurm(suite.name, left) if form == "slurm" else "\n".join(commands(left)))
+    else:
+        print("pacesetter: every run has finished", file=sys.stderr)
+    return 0
+
+
+def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
+    """Bring all runs to their end, and say how they ended."""
+    from pacesetter.cli.bench_progress import display
+    from pacesetter.study.bench.queue import Bench
+
+    if own["jobs"] is not None and own["jobs"] < 1:
+        raise UsageError(f"jobs: must be at least 1, got {own['jobs']}")
+    work = Bench(jobs)
+    work.check_envs()
+    executor = _executor(own)
+    with stopping(work.stop) as received, display(work, own["quiet"]) as show:
+        for _ in work.run(executor):
+            show(work)
+    for name, why in work.failed.items():
+        print(f"pacesetter: {name}: {why}", file=sys.stderr)
+    print(
+        f"{len(work.finished)} of {len(jobs)} runs finished, {work.before} of them before; "
+        f"{len(work.failed)} failed"
+    )
+    if received and len(work.finished) + len(work.failed) < len(jobs):
+        print(f"saved; continue with `pacesetter bench {shlex.join(words)}`")
+        return exit_code(received)
+    return 1 if work.failed else 0
+
+
+def _executor(own: dict[str, Any]) -> Any:
+    from pacesetter.study.bench.executors import Local, Ray
+
+    if own["executor"] == "ray":
+        return Ray(own["jobs"], own["address"])
+    return Local(own["jobs"] or len(cores()))

@@ -1,0 +1,114 @@
+"""The verbs `train` and `resume`."""
+
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from pacesetter.cli.flags import (
+    add_env_keywords,
+    add_quiet,
+    add_runs,
+    add_settings,
+    algorithm_and_env,
+    parser,
+    split_env_kwargs,
+)
+from pacesetter.process import exit_code, fix_threads, stopping
+from pacesetter.settings import Settings
+
+if TYPE_CHECKING:
+    from pacesetter.training.trainer import Trainer
+
+
+def train(words: list[str]) -> int:
+    """Train ALGO on ENV in a new run folder."""
+    return _run(_new_trainer, words)
+
+
+def resume(words: list[str]) -> int:
+    """Continue a run from its last checkpoint."""
+    return _run(_resumed_trainer, words)
+
+
+def _new_trainer(words: list[str]) -> tuple["Trainer", bool]:
+    """The new run of `train WORDS`, and whether it is quiet."""
+    command = parser("train", "Train an algorithm on a task.")
+    algorithm, env, rest = algorithm_and_env(command, words)
+    fix_threads()
+    _add_settings(command, algorithm, env)
+    rest, env_kwargs = split_env_kwargs(rest)
+    settings = vars(command.parse(rest))
+    settings.pop("env.KEY")
+    runs, quiet, config = (settings.pop(key) for key in ("runs", "quiet", "config"))
+    if env_kwargs:
+        settings["env_kwargs"] = env_kwargs
+    from pacesetter.training.trainer import Trainer
+
+    return Trainer(algorithm, env, runs=runs, config=config, **settings), quiet
+
+
+def _add_settings(command: Any, algorithm: str, env: str) -> None:
+    """All flags of `train ALGO ENV`, with the defaults of that algorithm on that task."""
+    from pacesetter import algorithms
+    from pacesetter.config import ENSEMBLE_SETTINGS, Run, preset_layers, resolve
+    from pacesetter.settings import OnPolicy
+
+    base, _ = preset_layers(algorithm, env)
+    hyper = algorithms.find(base).Hyper
+    defaults: Settings = resolve(algorithm, env).settings()
+    command.prog = f"pacesetter train {algorithm} {env}"
+    command.usage = f"{command.prog} [--SETTING VALUE ...]"
+    add_env_keywords(command)
+    command.add_argument("--config", metavar="FILE", help="read settings from a .toml or .json")
+    add_runs(command)
+    add_quiet(command)
+    hidden = ENSEMBLE_SETTINGS if issubclass(hyper, OnPolicy) else ()
+    add_settings(command, "settings of the run", Run, defaults, hidden)
+    add_settings(command, f"settings of {base}", hyper, defaults)
+
+
+def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
+    """The old run of `resume WORDS`, and whether it is quiet."""
+    from pacesetter.runs import find
+
+    command = parser("resume", "Continue a run from its last checkpoint, exactly as it would have.")
+    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
+    command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
+    command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
+    add_runs(command)
+    add_quiet(command)
+    found = command.parse(words)
+    directory = find(found.run, found.runs)
+    fix_threads(directory.record().get("threads"))
+    from pacesetter.training.trainer import Trainer
+
+    trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
+    for note in trainer.notes:
+        print(f"pacesetter: {note}", file=sys.stderr)
+    return trainer, found.quiet
+
+
+def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
+    """Train to the end or to a signal, and say where the result is."""
+    from pacesetter.cli.progress import console
+
+    final: Any = None
+    trainers: list[Trainer] = []
+    # From before JAX is imported, which dies of an exception of ours or swallows it.
+    with stopping(lambda: [each.stop() for each in trainers]) as received:
+        trainer, quiet = begin(words)
+        trainers.append(trainer)
+        if received:
+            trainer.stop()
+        with console(trainer, quiet) as sink:
+            for report in trainer:
+                sink(report)
+                final = report if report.kind == "eval" else final
+    run, step = trainer.config.run, trainer.progress.step
+    result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""
+    print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")
+    if received and not trainer.finished:
+        print(f"saved; continue with `pacesetter resume {trainer.directory.path}`")
+        return exit_code(received)
+    print(f"policy: {trainer.directory.policy_file}")
+    return 0

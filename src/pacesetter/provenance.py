@@ -1,0 +1,42 @@
+"""What a result needs to be repeated: command, versions, commit, machine, threads, backend."""
+
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from pacesetter.process import cores, threads
+
+PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
+
+
+def provenance(backend: str | None) -> dict[str, Any]:
+    """Where this process runs and with what; `backend` is JAX's."""
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "versions": versions(),
+        "commit": _commit(),
+        "threads": threads(),
+        "machine": f"{platform.machine()}, {len(cores())} cores",
+        "backend": backend,
+    }
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide results."""
+    return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def _commit() -> str | None:
+    checkout = Path(__file__).parents[2]
+    if not (checkout / ".git").exists() or not (git := shutil.which("git")):
+        return None
+    describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or None
