@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-slow check bench-speed clean
+.PHONY: demo test test-slow check docs wheel bench-speed clean
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -32,6 +32,16 @@ check: .venv/tested
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+.venv/documented: .venv/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	touch $@
+
+docs: .venv/documented
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+wheel: .venv/installed
+	$(BIN)/python scripts/try_wheel.py
+
 bench-speed: .venv/peers
 	$(BIN)/python benchmarks/speed.py
 	NPROC=1 taskset -c 0 $(BIN)/python benchmarks/ceiling.py
@@ -42,4 +52,4 @@ bench-speed: .venv/peers
 	$(BIN)/python benchmarks/models.py
 
 clean:
-	rm -rf .venv .pytest_cache .ruff_cache
+	rm -rf .venv .pytest_cache .ruff_cache site

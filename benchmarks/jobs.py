@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 from tabulate import tabulate
 
-START, REPORTED = 2_000, 1_000  # 1000 steps of warm-up, then 1000 that compile and resolve
+START, REPORTED = 2_000, 1_000  # 1000 steps of warm-up, then 1000 that compile and settle
 
 
 def measure(name: str, env: str, steps: int, seed: int) -> float:

@@ -82,7 +82,7 @@ TARGETS = {  # and stretch targets
 }
 SCALED = 0.9  # target, of the speed that operations foretell from HalfCheetah's
 PACKAGES = ("pacesetter", "jax", "torch", "stable-baselines3", "sbx-rl", "gymnasium", "mujoco")
-START = 2_000  # 1000 steps of warm-up, then 1000 that compile and resolve
+START = 2_000  # 1000 steps of warm-up, then 1000 that compile and settle
 REPORTED = 1_000  # pacesetter reports its training so often
 DISTURBED = 0.1  # cores that others kept busy, from which a ratio is worth nothing
 LONG = 1_000_000  # budget of a real run, so that replays have their real size

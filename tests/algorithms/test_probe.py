@@ -25,7 +25,7 @@ LEARNS: dict[str, Any] = {
     "exploration_noise": 0.5,
     "eval_every": 10_000,
 }
-NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can resolve
+NO_ENTROPY: dict[str, Any] = {  # values are returns alone, and the policy can settle
     "initial_alpha": 0.01,
     "alpha_learning_rate": 1e-6,
     "exploration_noise": None,

@@ -1,0 +1,43 @@
+"""What is said in several files is the same in all of them."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def read(name: str) -> Any:
+    return yaml.safe_load((ROOT / name).read_text())
+
+
+def test_one_version() -> None:
+    assert read("CITATION.cff")["version"] == PROJECT["version"]
+    newest = re.search(r"^## ([\d.]+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest
+    assert newest[1] == PROJECT["version"]
+
+
+def test_same_pythons() -> None:
+    """Those that are promised are those that CI runs and that `make wheel` proves."""
+    prefix = "Programming Language :: Python :: "
+    minors = [line.removeprefix(prefix) for line in PROJECT["classifiers"] if "3." in line]
+    assert (
+        read(".github/workflows/ci.yml")["jobs"]["test"]["strategy"]["matrix"]["python"] == minors
+    )
+    script = (ROOT / "scripts" / "try_wheel.py").read_text()
+    assert f"VERSIONS = {tuple(minors)}".replace("'", '"') in script
+    assert PROJECT["requires-python"] == f">={minors[0]}"
+
+
+def test_targets_that_pages_name_are_there() -> None:
+    made = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    pages = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "AGENTS.md", "CHANGELOG.md")]
+    text = "\n".join(page.read_text() for page in [*pages, *ROOT.glob("docs/**/*.md")])
+    named = set(re.findall(r"^make ([\w-]+)|`make ([\w-]+)`", text, re.MULTILINE))
+    assert {one or other for one, other in named} <= made
+    assert len(named) > 4
