@@ -118,27 +118,34 @@ def aim(world: Environment, size: tuple[int, int], camera: str | None = None) ->
     if not names:
         return
     _try_gl()
-    import mujoco
-
     task: Any = world.env.unwrapped
-    library: Any = mujoco
     model, renderer = task.model, task.mujoco_renderer
     renderer.width, renderer.height = size
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
     model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
     # Without a graphics card most of a frame's time goes into the shadow's 4096 by 4096 pixels.
     model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, SHADOW)
-    _lay_floor(model, library)
+    lay_floor(model)
     if camera == FREE:
         renderer.camera_id = -1
     elif camera is not None or renderer.camera_id == -1:
-        # A camera that stands still would lose the walker; -1, the free one, is what is left.
-        kind = library.mjtObj.mjOBJ_CAMERA
-        renderer.camera_id = library.mj_name2id(model, kind, camera or FOLLOW)
+        renderer.camera_id = camera_number(world, camera or FOLLOW)  # a still one would lose it
 
 
-def _lay_floor(model: Any, library: Any) -> None:
+def camera_number(world: Environment, name: str) -> int:
+    """The number of a MuJoCo model's camera; -1, the free one, if it has none of this name."""
+    import mujoco
+
+    library: Any = mujoco
+    task: Any = world.env.unwrapped
+    return library.mj_name2id(task.model, library.mjtObj.mjOBJ_CAMERA, name)
+
+
+def lay_floor(model: Any) -> None:
     """Draw patterned floors without end; quick walkers leave the part that is drawn of them."""
+    import mujoco
+
+    library: Any = mujoco
     model.vis.rgba.haze[:3] = HAZE
     for plane in np.flatnonzero(model.geom_type == library.mjtGeom.mjGEOM_PLANE):
         material, size = model.geom_matid[plane], model.geom_size[plane, :2].copy()
