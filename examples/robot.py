@@ -1,8 +1,7 @@
 """Run an exported policy where nothing but onnxruntime and NumPy is installed.
 
-`pacesetter export RUN --to onnx --out policy.onnx` makes the file; `python robot.py policy.onnx`
-runs it. Put your robot into `sense` and `move`: sensors in the order of the env's observation,
-actions in the env's units (of MuJoCo's walkers: torques as shares of the motors' gears).
+`python robot.py policy.onnx` runs the file; docs/export.md says how to make one. Put your
+robot into `sense` and `move`: sensors in the order of the env's observation, actions in its units.
 """
 
 import sys

@@ -75,8 +75,7 @@ def _one_line(repo_id: str) -> Generator[None]:
         hint = ""
         if isinstance(error, (errors.LocalTokenNotFoundError, errors.RepositoryNotFoundError)):
             hint = "; check the name, and log in with `hf auth login`"
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UsageError(f"hub: {repo_id}: {reason}{hint}") from None
+        raise UsageError(f"hub: {repo_id}: {str(error) or type(error).__name__}{hint}") from None
 
 
 def _command(path: Path) -> str | None:

@@ -21,7 +21,7 @@ if __name__ == "__main__":
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.monitor import Monitor
 
-    env = Monitor(gymnasium.make({env!r}, **{env_kwargs!r}))
+    env = Monitor(gymnasium.make({task}))
     mean, std = evaluate_policy(model, env, n_eval_episodes=10)
     print(f"return {{mean:.1f}} +- {{std:.1f}} over 10 episodes")
 '''
@@ -68,7 +68,7 @@ def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
     if file.exists():
         raise UsageError(f"sb3: {file} exists; give {path.name} another name")
     kwargs = policy.about.get("env_kwargs", {}) if name == policy.about.get("env") else {}
-    text = SCRIPT.format(env=name, env_kwargs=kwargs)
+    text = SCRIPT.format(task=f"{name!r}, **{kwargs!r}" if kwargs else repr(name))
     try:
         policy.save(file)
         write_atomically(path, text.encode())
