@@ -16,8 +16,11 @@ from policies import untrained
 
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
+from pacesetter.evaluation import evaluate
+from pacesetter.media.caption import caption
 from pacesetter.media.curve import curve
 from pacesetter.media.record import INSTALL, record
+from pacesetter.media.scene import draw, scene
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 
@@ -62,7 +65,8 @@ def test_mp4_has_the_frames_size_and_pace_of_the_task(
 ) -> None:
     jax.devices()  # its threads make every plain fork a warning, so an error here
     before = {name: os.environ.get(name) for name in TOLD}
-    assert record(cheetah, tmp_path / "film.mp4", frames=10) == 10
+    film = record(cheetah, tmp_path / "film.mp4", frames=10, size=(320, 240))
+    assert film == (10, 20.0, [])
     assert {name: os.environ.get(name) for name in TOLD} == before
     frames, about = frames_of(tmp_path / "film.mp4", monkeypatch)
     assert [frame.shape for frame in frames] == [(240, 320, 3)] * 10
@@ -77,7 +81,7 @@ def test_gif_of_another_version_of_the_task(
     cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "film.gif"
-    assert record(cheetah, path, env="HalfCheetah-v4", frames=5, size=(64, 48)) == 5
+    assert record(cheetah, path, env="HalfCheetah-v4", frames=5, size=(64, 48)).frames == 5
     frames, about = frames_of(path, monkeypatch)
     assert [frame.shape[:2] for frame in frames] == [(48, 64)] * 5
     assert about["duration"] == 50
@@ -97,25 +101,20 @@ def test_episodes_that_end_early_start_anew(
 
     monkeypatch.setattr(Environment, "reset", count)
     pendulum = untrained("InvertedPendulum-v5")
-    assert record(pendulum, tmp_path / "falls.mp4", frames=60) == 60
+    assert record(pendulum, tmp_path / "falls.mp4", frames=60, size=(64, 48)).frames == 60
     assert len(frames_of(tmp_path / "falls.mp4", monkeypatch)[0]) == 60
     assert entered[1:4] == [0, 1, 2]  # the first entry of all is the check
 
 
 @pytest.mark.usefixtures("gl")
 def test_camera_follows_the_walker_far_from_the_start(cheetah: Policy) -> None:
-    from pacesetter.media import record as module
-
-    with module._gl():
-        world = module.enter(cheetah, None, 0, render_mode="rgb_array")
-        module._aim(world, (320, 240))
+    with scene(cheetah, None, None, 0, (320, 240), None) as world:
         world.reset(0)
         task: Any = world.env.unwrapped
-        near = module._draw(world)
+        near = draw(world)
         task.data.qpos[0] += 30.0
         task.set_state(task.data.qpos, task.data.qvel)
-        far = module._draw(world)
-        module._leave(world)
+        far = draw(world)
     # The cheetah is the only thing with more red than blue.
     columns = [np.nonzero(frame[..., 0] > frame[..., 2] + 40.0)[1] for frame in (near, far)]
     assert columns[0].size > 500
@@ -127,10 +126,11 @@ def test_camera_follows_the_walker_far_from_the_start(cheetah: Policy) -> None:
 def test_an_old_film_that_is_freed_late_leaves_a_new_one_alone(
     cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pacesetter.media import record as module
+    from pacesetter.media import record as film
+    from pacesetter.media import scene as stage
 
     kept: list[Any] = []
-    leave, draw = module._leave, module._draw
+    leave, draw = stage.leave, stage.draw
 
     def leave_and_keep(world: Any) -> None:
         kept.append(world.env.unwrapped)
@@ -141,10 +141,10 @@ def test_an_old_film_that_is_freed_late_leaves_a_new_one_alone(
         kept.clear()
         return frame
 
-    monkeypatch.setattr(module, "_leave", leave_and_keep)
+    monkeypatch.setattr(stage, "leave", leave_and_keep)
     record(cheetah, tmp_path / "old.gif", frames=2, size=(32, 32))
-    monkeypatch.setattr(module, "_draw", draw_and_forget)
-    record(cheetah, tmp_path / "new.mp4", frames=4)
+    monkeypatch.setattr(film, "draw", draw_and_forget)
+    record(cheetah, tmp_path / "new.mp4", frames=4, size=(320, 240))
     frames, _ = frames_of(tmp_path / "new.mp4", monkeypatch)
     assert min(frame.mean() for frame in frames) > 50
 
@@ -191,6 +191,10 @@ except UsageError as error:
     [
         ({"path": "film.avi"}, r"\.mp4 or \.gif"),
         ({"frames": 0}, "frames: must be at least 1"),
+        ({"episodes": 0}, "episodes: must be at least 1, got 0"),
+        ({"camera": "trak"}, "camera: unknown 'trak'; did you mean track"),
+        ({"camera": "roof"}, "camera: unknown 'roof'; allowed: free, track"),
+        ({"env": "Pendulum-v1", "camera": "track"}, "observations of 3"),
         ({"size": (321, 240)}, "size: both sides must be even"),
         ({"env": "Hopper-v5"}, "observations of 11"),
         ({"env": "HalfCheetah-v77"}, "unknown 'HalfCheetah-v77'"),
@@ -206,10 +210,76 @@ def test_bad_input_is_one_line(
     assert not path.exists()
 
 
-@pytest.mark.usefixtures("gl")
 def test_a_folder_that_is_not_there_is_one_line(cheetah: Policy, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         record(cheetah, tmp_path / "none" / "film.mp4", frames=1)
+
+
+def short(**about: Any) -> Policy:
+    """A cheetah whose episodes end after seven steps."""
+    return untrained("HalfCheetah-v5", env_kwargs={"max_episode_steps": 7}, **about)
+
+
+@pytest.mark.usefixtures("gl")
+def test_one_episode_by_default_and_drawing_changes_no_return(tmp_path: Path) -> None:
+    film = record(short(), tmp_path / "film.gif", size=(64, 48), seed=5)
+    assert film == (8, 20.0, evaluate(short(), episodes=1, seed=5).returns)
+    two = record(short(), tmp_path / "two.gif", size=(64, 48), seed=5, episodes=2)
+    assert two == (16, 20.0, evaluate(short(), episodes=2, seed=5).returns)
+    cut = record(short(), tmp_path / "cut.gif", size=(64, 48), seed=5, episodes=2, frames=9)
+    assert cut == (9, 20.0, two.returns[:1])
+
+
+@pytest.mark.usefixtures("gl")
+def test_a_quick_task_keeps_its_pace_with_fewer_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hopper = untrained("Hopper-v5", env_kwargs={"max_episode_steps": 7})  # 125 steps a second
+    path = tmp_path / "film.mp4"
+    film = record(hopper, path, size=(64, 48))
+    assert (film.frames, film.rate) == (4, pytest.approx(125 / 3))  # steps 0, 3, 6 and 7
+    assert frames_of(path, monkeypatch)[1]["fps"] == pytest.approx(125 / 3, abs=0.01)
+
+
+@pytest.mark.usefixtures("gl")
+def test_step_and_return_stand_in_the_frame_and_can_be_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def remember(frame: Any, text: str) -> Any:
+        said.append(text)
+        return caption(frame, text)
+
+    monkeypatch.setattr("pacesetter.media.record.caption", remember)
+    film = record(short(), tmp_path / "film.gif", size=(320, 240))
+    assert said[0] == "step 0   return 0.0"
+    assert said[-1] == f"step 7   return {film.returns[0]:,.1f}"
+    record(short(), tmp_path / "bare.gif", size=(320, 240), text=False)
+    assert len(said) == film.frames
+    with_text, bare = (
+        frames_of(tmp_path / f"{name}.gif", monkeypatch)[0][0][..., :3] for name in ("film", "bare")
+    )
+    apart = np.abs(with_text.astype(int) - bare).max(axis=-1) > 40
+    assert apart[:40, :160].mean() > 0.2
+    assert apart[60:].mean() < 0.01
+
+
+@pytest.mark.usefixtures("gl")
+def test_cameras_differ_and_the_floor_has_no_end(cheetah: Policy) -> None:
+    pictures = {}
+    for camera in ("track", "free", None):
+        with scene(cheetah, None, None, 0, (64, 48), camera) as world:
+            world.reset(0)
+            pictures[camera] = draw(world)
+            task: Any = world.env.unwrapped
+            task.data.qpos[0] += 300.0
+            task.set_state(task.data.qpos, task.data.qvel)
+            far = draw(world)
+    assert np.array_equal(pictures["track"], pictures[None])
+    assert not np.array_equal(pictures["track"], pictures["free"])
+    assert far[40:].min() < 20  # a black square
+    assert far[40:].max() > 120  # a light one
 
 
 def test_a_file_cannot_make_its_reader_import_a_module(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Pictures of a run: its learning curve and a film of its policy."""
+"""Pictures of a run and its policy, and the policy in the forms of other programs."""

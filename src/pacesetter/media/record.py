@@ -1,161 +1,93 @@
 """A film of a policy at its task, drawn without a display."""
 
-import importlib
-import os
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
-from itertools import chain
+from collections.abc import Iterator
+from itertools import chain, count, islice
+from math import ceil
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
-from pacesetter.evaluation import enter
+from pacesetter.media.caption import caption
+from pacesetter.media.scene import INSTALL as INSTALL
+from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene, setting
 from pacesetter.policy import Policy
 
-Frame = NDArray[np.uint8]
-INSTALL = "apt-get install -y --no-install-recommends libegl1 libgl1"
 SUFFIXES = (".mp4", ".gif")
+FASTEST = 50.0  # frames per second; a GIF knows no more and eyes see no more
+
+
+class Film(NamedTuple):
+    """What was written: frames, frames per second, and the return of each episode that ended."""
+
+    frames: int
+    rate: float
+    returns: list[float]
 
 
 def record(
     policy: Policy,
     path: str | Path,
     *,
+    episodes: int | None = None,
+    frames: int | None = None,
+    camera: str | None = None,
+    size: tuple[int, int] = (640, 480),
     env: str | None = None,
-    frames: int = 200,
-    size: tuple[int, int] = (320, 240),
+    env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
-) -> int:
-    """Film seeded episodes, one after another, at the env's own pace; returns the frames written.
+    text: bool = True,
+) -> Film:
+    """Film seeded episodes, one after another, at the env's own pace, as .mp4 or .gif.
 
+    Films `episodes` (default 1, or without end where `frames` is given), at most `frames` frames.
+    `camera` is one of a MuJoCo model's own, or `free`; default `track`, which follows the walker.
     `size` is that of MuJoCo tasks; others draw in a size of their own.
     """
     path = Path(path)
-    _check(path, frames, size)
-    with _gl():
-        world = enter(policy, env, seed, render_mode="rgb_array")
-        try:
-            _aim(world, size)
-            rate = float(world.env.metadata.get("render_fps") or 30)
-            return _write(path, _film(policy, world, frames), rate)
-        finally:
-            _leave(world)
+    _check(path, episodes, frames)
+    check_size(size)
+    if episodes is None and frames is None:
+        episodes = 1
+    returns: list[float] = []
+    with scene(policy, env, env_kwargs, seed, size, camera) as world:
+        pace = float(world.env.metadata.get("render_fps") or 30)
+        every = ceil(pace / FASTEST)
+        film = _film(policy, world, episodes, every, returns, text)
+        written = _write(path, islice(film, frames), pace / every)
+    return Film(written, pace / every, returns)
 
 
-def _check(path: Path, frames: int, size: tuple[int, int]) -> None:
+def _check(path: Path, episodes: int | None, frames: int | None) -> None:
     if path.suffix not in SUFFIXES:
         raise UsageError(f"video: {path} must end in {' or '.join(SUFFIXES)}")
-    if frames < 1:
-        raise UsageError(f"frames: must be at least 1, got {frames}")
-    # yuv420p, which every player shows, stores colour for two by two pixels.
-    if min(size) < 2 or any(side % 2 for side in size):
-        raise UsageError(f"size: both sides must be even, got {size[0]}x{size[1]}")
+    for name, number in (("episodes", episodes), ("frames", frames)):
+        if number is not None and number < 1:
+            raise UsageError(f"{name}: must be at least 1, got {number}")
+    check_folder("video", path)
 
 
-@contextmanager
-def _gl() -> Generator[None]:
-    """Let MuJoCo draw by EGL where no display is, and only in here.
-
-    MuJoCo comes first: with MUJOCO_GL=egl and no EGL it could never be imported again.
-    """
-    try:
-        import mujoco  # noqa: F401  # pyright: ignore[reportUnusedImport]
-    except Exception:
-        raise _no_gl() from None
-    chosen = os.environ.get("MUJOCO_GL")
-    with _setting("MUJOCO_GL", chosen if chosen or os.environ.get("DISPLAY") else "egl"):
-        yield
-
-
-@contextmanager
-def _setting(name: str, value: str | None) -> Generator[None]:
-    """An environment variable for a while, for libraries that are told things only so."""
-    before = os.environ.get(name)
-    try:
-        if value is not None:
-            os.environ[name] = value
-        yield
-    finally:
-        os.environ.pop(name, None)
-        if before is not None:
-            os.environ[name] = before
-
-
-def _no_gl() -> UsageError:
-    backend = os.environ.get("MUJOCO_GL", "unset")
-    return UsageError(
-        f"video: no OpenGL to draw with (MUJOCO_GL={backend}); MUJOCO_GL=egl needs `{INSTALL}`"
-    )
-
-
-def _aim(world: Environment, size: tuple[int, int]) -> None:
-    """Set MuJoCo's size and the camera that follows the walker; by default it would walk away."""
-    import mujoco
-
-    if not _is_mujoco(world):
-        return
-    _try_gl()
-    library: Any = mujoco
-    task: Any = world.env.unwrapped
-    model, renderer = task.model, task.mujoco_renderer
-    renderer.width, renderer.height = size
-    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
-    model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
-    if renderer.camera_id == -1:
-        renderer.camera_id = library.mj_name2id(model, library.mjtObj.mjOBJ_CAMERA, "track")
-
-
-def _is_mujoco(world: Environment) -> bool:
-    from gymnasium.envs.mujoco import MujocoEnv
-
-    return isinstance(world.env.unwrapped, MujocoEnv)
-
-
-def _leave(world: Environment) -> None:
-    """Close the env; MuJoCo's picture buffers first.
-
-    Garbage collection would free them by number in whatever film is drawn then, and blacken it.
-    """
-    task: Any = world.env.unwrapped
-    if _is_mujoco(world) and (viewer := task.mujoco_renderer.viewer) is not None:
-        viewer.make_context_current()
-        viewer.con.free()
-    world.close()
-
-
-def _try_gl() -> None:
-    """Fail here rather than in Gymnasium, which prints a traceback when it frees what failed."""
-    backend = os.environ.get("MUJOCO_GL")
-    if backend not in ("egl", "osmesa"):
-        return
-    try:
-        importlib.import_module(f"mujoco.{backend}").GLContext(1, 1).free()
-    except Exception:
-        raise _no_gl() from None
-
-
-def _film(policy: Policy, world: Environment, frames: int) -> Iterator[Frame]:
-    observation = world.reset()
-    for _ in range(frames):
-        yield _draw(world)
-        step = world.step(policy.act(observation))
-        observation = world.reset() if step.ended else step.observation
-
-
-def _draw(world: Environment) -> Frame:
-    try:
-        frame: Any = world.env.render()
-    except Exception as error:
-        if _is_mujoco(world):
-            raise _no_gl() from None
-        raise UsageError(f"env: {world.name} cannot be drawn: {error}") from None
-    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.dtype != np.uint8:
-        raise UsageError(f"env: {world.name} gives no picture in the mode rgb_array")
-    return frame
+def _film(
+    policy: Policy,
+    world: Environment,
+    episodes: int | None,
+    every: int,
+    returns: list[float],
+    text: bool,
+) -> Iterator[Frame]:
+    """Every so many steps a frame, and one of each episode's end; its return goes to `returns`."""
+    for _ in count() if episodes is None else range(episodes):
+        observation, step, ended = world.reset(), 0, False
+        while True:
+            if ended:
+                returns.append(world.earned)
+            if ended or step % every == 0:
+                words = f"step {step:,}   return {world.earned:,.1f}"
+                yield caption(draw(world), words) if text else draw(world)
+            if ended:
+                break
+            observation, _, terminated, truncated, _ = world.step(policy.act(observation))
+            step, ended = step + 1, terminated or truncated
 
 
 def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
@@ -168,7 +100,7 @@ def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
         path.open("wb").close()  # a refusal comes as one line here, from ffmpeg as many
         # Otherwise ffmpeg is started by a plain fork, which JAX's threads make unsafe.
         with (
-            _setting("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1"),
+            setting("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1"),
             library.get_writer(path, **_options(path.suffix, rate)) as writer,
         ):
             for frame in chain([first], film):

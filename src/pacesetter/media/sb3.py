@@ -1,0 +1,77 @@
+"""A policy as Stable-Baselines3 expects a model: an object with `predict`."""
+
+from pathlib import Path
+from typing import Any
+
+from pacesetter.errors import UsageError
+from pacesetter.policy import Floats, Policy
+from pacesetter.storage import write_atomically
+
+SCRIPT = '''"""`model` is a policy as Stable-Baselines3 expects one; run it to evaluate."""
+
+from pathlib import Path
+
+from pacesetter import load
+from pacesetter.media.sb3 import SB3Policy
+
+model = SB3Policy(load(Path(__file__).with_suffix(".safetensors")))
+
+if __name__ == "__main__":
+    import gymnasium
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.monitor import Monitor
+
+    env = Monitor(gymnasium.make({task}))
+    mean, std = evaluate_policy(model, env, n_eval_episodes=10)
+    print(f"return {{mean:.1f}} +- {{std:.1f}} over 10 episodes")
+'''
+
+
+class SB3Policy:
+    """What `evaluate_policy` of Stable-Baselines3 takes for a model; needs no part of it.
+
+    It can act; it cannot be trained on, since a policy file holds no critics and no optimiser.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[Any, ...] | None = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Floats, tuple[Any, ...] | None]:
+        """Actions in the env's units for one observation or a batch, and the state as it came.
+
+        Policy files hold the mean action alone, so `deterministic=False` gives the same action.
+        """
+        return self.policy(observation), state
+
+
+def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
+    """Write a short script that makes the `model`, and beside it the policy file, which it names.
+
+    No SB3 .zip is written: it would have to claim critics and an optimiser that are not there.
+    """
+    if path.suffix != ".py":
+        raise UsageError(f"sb3: {path} must end in .py")
+    name = env or policy.about.get("env")
+    if name is None:
+        raise UsageError("env: none given and the policy names none")
+    if env is None and ":" in name:
+        raise UsageError(
+            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
+        )
+    file = path.with_suffix(".safetensors")
+    if file.exists():
+        raise UsageError(f"sb3: {file} exists; give {path.name} another name")
+    kwargs = policy.about.get("env_kwargs", {}) if name == policy.about.get("env") else {}
+    text = SCRIPT.format(task=f"{name!r}, **{kwargs!r}" if kwargs else repr(name))
+    try:
+        policy.save(file)
+        write_atomically(path, text.encode())
+    except OSError as error:
+        raise UsageError(f"sb3: cannot write {path}: {error.strerror}") from None
+    return file
