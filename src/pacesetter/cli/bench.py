@@ -81,7 +81,7 @@ def _suite(name: str | None, algos: list[str] | None) -> Suite:
 def _add_settings_of(suite: Suite, command: Parser) -> None:
     from pacesetter import algorithms
 
-    add_settings(command, "settings of all runs", Run, None)
+    add_settings(command, "settings of all runs", Run, None, suites.DECIDED)
     names = [entry.get("algorithm", name) for name, entry in suite.entries.items()]
     for base in dict.fromkeys(preset_layers(name, "")[0] for name in names):
         add_settings(command, f"settings of {base}", algorithms.find(base).Hyper, None)
