@@ -109,15 +109,20 @@ def enter(
     world = Environment(name, own | extra, seed, Stream.REPORT)
     world.check()
     if policy is not None:
-        taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
-        if (taken, given) != (world.observation_size, world.action_size):
-            raise UsageError(
-                f"env: {name} has observations of {world.observation_size} and actions of "
-                f"{world.action_size}; the policy takes {taken} and gives {given}"
-            )
-        if not (np.array_equal(policy.low, world.low) and np.array_equal(policy.high, world.high)):
-            raise UsageError(f"env: {name} has other action bounds than the policy")
+        _refuse_unfit(policy, world)
     return world
+
+
+def _refuse_unfit(policy: Policy, world: Environment) -> None:
+    """Refuse a policy of other sizes or action bounds than the env's."""
+    taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+    if (taken, given) != (world.observation_size, world.action_size):
+        raise UsageError(
+            f"env: {world.name} has observations of {world.observation_size} and actions of "
+            f"{world.action_size}; the policy takes {taken} and gives {given}"
+        )
+    if not (np.array_equal(policy.low, world.low) and np.array_equal(policy.high, world.high)):
+        raise UsageError(f"env: {world.name} has other action bounds than the policy")
 
 
 def _acting(policy: Policy | None, env: Environment, noise: float, seed: int) -> Act:

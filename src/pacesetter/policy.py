@@ -171,17 +171,8 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
             raise ValueError(f"{name} must hold finite float32 numbers")
     inputs = policy.actors[0][0]["kernel"].shape[0]
     for layers in policy.actors:
-        size = inputs
-        for layer in layers:
-            if layer.keys() not in LAYERS:
-                raise ValueError(f"a layer has {', '.join(sorted(layer))}")
-            shape = layer["kernel"].shape
-            if len(shape) != 2 or shape[0] != size:
-                raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")
-            size = shape[1]
-            if any(x.shape != (size,) for name, x in layer.items() if name != "kernel"):
-                raise ValueError("a layer's bias or norm does not fit it")
-        if policy.low.shape != (size,) or policy.high.shape != (size,):
+        outputs = _check_layers(layers, inputs)
+        if policy.low.shape != (outputs,) or policy.high.shape != (outputs,):
             raise ValueError("its last layer does not fit its bounds")
     sizes = [math.prod(shape) for shape in policy.shapes or ((inputs,), policy.low.shape)]
     if sizes != [inputs, len(policy.low)]:
@@ -192,6 +183,20 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
         mean, deviation = policy.normalizer
         if mean.shape != (inputs,) or deviation.shape != (inputs,) or not (deviation > 0).all():
             raise ValueError("its normalization does not fit its networks")
+
+
+def _check_layers(layers: Layers, size: int) -> int:
+    """Refuse layers that do not fit each other or an input of a size; the size of the output."""
+    for layer in layers:
+        if layer.keys() not in LAYERS:
+            raise ValueError(f"a layer has {', '.join(sorted(layer))}")
+        shape = layer["kernel"].shape
+        if len(shape) != 2 or shape[0] != size:
+            raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")
+        size = shape[1]
+        if any(x.shape != (size,) for name, x in layer.items() if name != "kernel"):
+            raise ValueError("a layer's bias or norm does not fit it")
+    return size
 
 
 def _shapes(table: Any) -> tuple[Shape, Shape] | None:

@@ -49,7 +49,7 @@ class RunDirectory:
         if not self.config_file.exists():
             self._refuse_other_seeds(config)
             return
-        resume = f"continue it with `pacesetter resume {self.path}`"
+        resume = f"go on with `pacesetter resume {self.path}`"
         if found := self.difference_from(config):
             raise UsageError(
                 f"run: {self.path} exists with {found}; give this one another --name, or {resume}"

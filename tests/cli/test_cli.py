@@ -148,7 +148,7 @@ def test_help_of_train_has_every_setting(command: Command) -> None:
     hidden = {"algorithm", "env", "env_kwargs"}
     assert [n for n in names if f"--{n.replace('_', '-')}" not in text and n not in hidden] == []
     assert "at least 0; at most 1; default 0.99" in text
-    assert "full or weights or actor; default full" in text
+    assert "full, weights or actor; default full" in text
     assert not Path("runs").exists()
 
 

@@ -5,15 +5,7 @@ import shlex
 import sys
 from typing import Any
 
-from pacesetter.cli.flags import (
-    Parser,
-    add_env_keywords,
-    add_quiet,
-    add_runs,
-    add_settings,
-    parser,
-    split_env_kwargs,
-)
+from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
 from pacesetter.config import Run, preset_layers
 from pacesetter.errors import UsageError
 from pacesetter.process import cores, exit_code, stopping
@@ -74,8 +66,8 @@ def _parser(name: str | None) -> Parser:
     address = "address of a running Ray cluster, such as auto (default a new one)"
     add("--address", metavar="A", help=address)
     add("--print", choices=("commands", "slurm"), help="print the remaining runs, start none")
-    add_runs(command)
-    add_quiet(command)
+    command.add_runs()
+    command.add_quiet()
     return command
 
 
@@ -89,11 +81,11 @@ def _suite(name: str | None, algos: list[str] | None) -> Suite:
 def _add_settings_of(suite: Suite, command: Parser) -> None:
     from pacesetter import algorithms
 
-    add_settings(command, "settings of all runs", Run, None)
+    add_settings(command, "settings of all runs", Run, None, suites.DECIDED)
     names = [entry.get("algorithm", name) for name, entry in suite.entries.items()]
     for base in dict.fromkeys(preset_layers(name, "")[0] for name in names):
         add_settings(command, f"settings of {base}", algorithms.find(base).Hyper, None)
-    add_env_keywords(command)
+    command.add_env_keywords()
 
 
 def _print(suite: Suite, jobs: list[suites.Job], form: str) -> int:
@@ -128,7 +120,7 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
         f"{len(work.failed)} failed"
     )
     if received and len(work.finished) + len(work.failed) < len(jobs):
-        print(f"saved; continue with `pacesetter bench {shlex.join(words)}`")
+        print(f"saved; go on with `pacesetter bench {shlex.join(words)}`")
         return exit_code(received)
     return 1 if work.failed else 0
 

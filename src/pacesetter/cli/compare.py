@@ -1,6 +1,6 @@
 """The verb `compare`."""
 
-from pacesetter.cli.flags import Parser, add_runs, parser
+from pacesetter.cli.flags import Parser, parser
 
 
 def compare(words: list[str]) -> int:
@@ -46,5 +46,5 @@ def _parser() -> Parser:
     add("--no-film", action="store_true", help="leave the video out of the report")
     output = "write a .html report, .md or .tex tables, or .pdf curves; may be repeated"
     add("-o", action="append", default=[], metavar="FILE", help=output)
-    add_runs(command)
+    command.add_runs()
     return command

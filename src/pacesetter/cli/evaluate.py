@@ -5,7 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pacesetter.cli.flags import Parser, add_env_keywords, add_runs, parser, split_env_kwargs
+from pacesetter.cli.flags import Parser, parser, split_env_kwargs
 
 if TYPE_CHECKING:
     from pacesetter.evaluation import Evaluation
@@ -45,10 +45,10 @@ def _parser() -> Parser:
     noise = "standard deviation of Gaussian noise on actions in [-1, 1] (default 0)"
     add("--noise", type=float, default=0.0, metavar="X", help=noise)
     add("--env", metavar="ID", help="task to play (default the policy's own)")
-    add_env_keywords(command)
+    command.add_env_keywords()
     add("--random", action="store_true", help="play uniformly random actions instead")
     add("--json", action="store_true", help="print all returns as JSON")
-    add_runs(command)
+    command.add_runs()
     return command
 
 

@@ -34,6 +34,19 @@ class Parser(argparse.ArgumentParser):
         """Whether a flag has been added."""
         return flag in self._option_string_actions
 
+    def add_runs(self) -> None:
+        """`--runs`, the folder of all runs."""
+        about = "folder of runs (default runs)"
+        self.add_argument("--runs", default="runs", metavar="DIR", help=about)
+
+    def add_quiet(self) -> None:
+        """`--quiet`, for verbs that show progress."""
+        self.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+
+    def add_env_keywords(self) -> None:
+        """`--env.KEY` in the help; `split_env_kwargs` takes it out of the words before parsing."""
+        self.add_argument("--env.KEY", metavar="VALUE", help="keyword for the env's constructor")
+
 
 def parser(prog: str, description: str) -> Parser:
     """A parser that takes whole flags only: then a new flag never changes what a command means."""
@@ -53,23 +66,6 @@ def algorithm_and_env(command: Parser, words: list[str]) -> tuple[str, str, list
         raise UsageError(f"{command.prog.split()[-1]}: ALGO and ENV come first, then settings")
     command.parse(words)
     raise AssertionError("argparse ends on too few words")
-
-
-def add_runs(command: Parser) -> None:
-    """`--runs`, the folder of all runs."""
-    command.add_argument(
-        "--runs", default="runs", metavar="DIR", help="folder of runs (default runs)"
-    )
-
-
-def add_quiet(command: Parser) -> None:
-    """`--quiet`, for verbs that show progress."""
-    command.add_argument("-q", "--quiet", action="store_true", help="show no progress")
-
-
-def add_env_keywords(command: Parser) -> None:
-    """`--env.KEY`, for help alone: `split_env_kwargs` takes it out of the words."""
-    command.add_argument("--env.KEY", metavar="VALUE", help="keyword for the env's constructor")
 
 
 def add_settings(

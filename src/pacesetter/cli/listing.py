@@ -6,7 +6,7 @@ from typing import Any
 from tabulate import tabulate
 
 from pacesetter.budget import budget, is_spent
-from pacesetter.cli.flags import add_runs, parser
+from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, RunDirectory, find, find_all
 
@@ -18,7 +18,7 @@ def list_(words: list[str]) -> int:
     command = parser("list", "List algorithms, envs, rules, presets, suites or runs.")
     nouns = [*LISTS, "runs"]
     command.add_argument("noun", metavar="|".join(nouns), help="what to list")
-    add_runs(command)
+    command.add_runs()
     found = command.parse(words)
     if found.noun not in nouns:
         raise unknown("list", found.noun, nouns)
@@ -31,7 +31,7 @@ def show(words: list[str]) -> int:
     """Show a run: how far it is, how it scores, what it spent, its settings."""
     command = parser("show", "Show a run: how far it is, how it scores, what it spent.")
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
-    add_runs(command)
+    command.add_runs()
     found = command.parse(words)
     for line in describe(find(found.run, found.runs)):
         print(line)

@@ -4,15 +4,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from pacesetter.cli.flags import (
-    add_env_keywords,
-    add_quiet,
-    add_runs,
-    add_settings,
-    algorithm_and_env,
-    parser,
-    split_env_kwargs,
-)
+from pacesetter.cli.flags import add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 
@@ -58,10 +50,10 @@ def _add_settings(command: Any, algorithm: str, env: str) -> None:
     defaults: Settings = resolve(algorithm, env).settings()
     command.prog = f"pacesetter train {algorithm} {env}"
     command.usage = f"{command.prog} [--SETTING VALUE ...]"
-    add_env_keywords(command)
+    command.add_env_keywords()
     command.add_argument("--config", metavar="FILE", help="read settings from a .toml or .json")
-    add_runs(command)
-    add_quiet(command)
+    command.add_runs()
+    command.add_quiet()
     hidden = ENSEMBLE_SETTINGS if issubclass(hyper, OnPolicy) else ()
     add_settings(command, "settings of the run", Run, defaults, hidden)
     add_settings(command, f"settings of {base}", hyper, defaults)
@@ -75,8 +67,8 @@ def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
     command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
     command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
-    add_runs(command)
-    add_quiet(command)
+    command.add_runs()
+    command.add_quiet()
     found = command.parse(words)
     directory = find(found.run, found.runs)
     fix_threads(directory.record().get("threads"))
@@ -108,7 +100,7 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
     result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""
     print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")
     if received and not trainer.finished:
-        print(f"saved; continue with `pacesetter resume {trainer.directory.path}`")
+        print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
         return exit_code(received)
     print(f"policy: {trainer.directory.policy_file}")
     return 0

@@ -3,15 +3,7 @@
 import shlex
 from typing import Any
 
-from pacesetter.cli.flags import (
-    Parser,
-    add_env_keywords,
-    add_quiet,
-    add_settings,
-    algorithm_and_env,
-    parser,
-    split_env_kwargs,
-)
+from pacesetter.cli.flags import Parser, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 
@@ -29,7 +21,7 @@ def tune(words: list[str]) -> int:
         tuning.run(lambda trainer: console(trainer, own["quiet"]))
     print(tuning.summary())
     if received and not tuning.over:
-        print(f"saved; continue with `pacesetter tune {shlex.join(words)}`")
+        print(f"saved; go on with `pacesetter tune {shlex.join(words)}`")
         return exit_code(received)
     return 0
 
@@ -57,8 +49,8 @@ def _add_own_flags(command: Parser) -> None:
     add("--trials", type=int, default=50, metavar="N", help="trials in all (default 50)")
     study = "file that workers share (default tune.log)"
     add("--study", default="tune.log", metavar="FILE", help=study)
-    add_env_keywords(command)
-    add_quiet(command)
+    command.add_env_keywords()
+    command.add_quiet()
 
 
 def _add_settings(command: Parser, algorithm: str, env: str) -> None:

@@ -5,6 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,7 @@ METRICS = {
 }
 CONTROL = "td3"
 ANT = "pacesetter/Ant111"
-# Seeds of one name may differ in these. `train` also lets the horizon follow from --steps, but
-# weights that are annealed at another speed are another algorithm, of which a table must tell.
+# `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
 _FREE = FREE_PER_SEED - {"replay_horizon"}
 _SPENT = ("steps", "updates", "transitions", "cpu", "wall")
 
@@ -132,14 +132,10 @@ def compare(
     kept, notes = _complete(found, empty, limit)
     _refuse_twins(kept)
     notes += _mixtures(kept, mixed, limit)
-    grouped: dict[tuple[str, str], list[Run]] = defaultdict(list)
-    for run in kept:
-        grouped[run.env, run.name].append(run)
-    groups = [
-        Group(env, name, sorted(same, key=lambda run: (run.seed, run.budget)))
-        for (env, name), same in sorted(grouped.items())
-    ]
-    return Comparison(groups, metric, reference, notes + _remarks(groups, limit))
+    kept.sort(key=lambda run: (run.env, run.name, run.seed, run.budget))
+    grouped = groupby(kept, lambda run: (run.env, run.name))
+    groups = [Group(env, name, list(same)) for (env, name), same in grouped]
+    return Comparison(groups, metric, reference, notes + _remarks(groups, kept, limit))
 
 
 def split(env: str) -> tuple[str, str]:
@@ -226,15 +222,13 @@ def _differing(runs: list[Run]) -> list[str]:
     return list(faults.values())
 
 
-def _remarks(groups: list[Group], limit: Limit) -> list[str]:
+def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     """Notes on what is no reason to refuse."""
-    runs = [run for group in groups for run in group.runs]
     notes: list[str] = []
-    few = [
-        f"{g.env} {g.name} (n={len(g.runs)})" for g in groups if len(g.runs) < stats.FEWEST_SEEDS
-    ]
+    few = [group for group in groups if len(group.runs) < stats.FEWEST_SEEDS]
     if few:
-        notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {_few(few)}.")
+        names = _few([f"{group.env} {group.name} (n={len(group.runs)})" for group in few])
+        notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {names}.")
     if limit.budget or limit.cpu:
         notes.append(f"Every run counts up to {limit}.")
     if any(run.settings.get("count_selection_steps") is False for run in runs):

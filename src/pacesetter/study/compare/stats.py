@@ -196,9 +196,7 @@ def difference(x: Array, y: Array) -> Interval:
         return Interval(value)
     if np.ptp(x) == 0 == np.ptp(y):
         return Interval(value, value, value)
-    with (
-        warnings.catch_warnings()
-    ):  # SciPy warns if one group's runs are equal, which is no fault here
+    with warnings.catch_warnings():  # SciPy warns if all runs of one group are equal
         warnings.simplefilter("ignore", RuntimeWarning)
         found = scipy.ttest_ind(x, y, equal_var=False).confidence_interval(CONFIDENCE)
     return Interval(value, float(found.low), float(found.high))

@@ -129,15 +129,14 @@ def selections(comparison: Comparison) -> list[Table]:
         chosen = [run for run in group.runs if run.selections]
         for run in chosen:
             found = lineage.Selections.of(run.selections)
-            count, flips = len(found.gaps), found.flips.mean()
             rows.append(
                 [
                     word(group.env),
                     word(group.name),
                     number(run.seed),
-                    number(count),
+                    number(len(found.gaps)),
                     number(float(np.median(found.ratios)), 2),
-                    number(100 * flips, 0, "%"),
+                    number(100 * found.flips.mean(), 0, "%"),
                     word(found.founding),
                     word(lineage.shorten(found.line)),
                 ]

@@ -78,13 +78,13 @@ def _ours(groups: list[Group], name: str) -> Iterator[list[Cell]]:
             row = [word(name), word(f"ours, {metric}{' (inflated)' if metric == 'max' else ''}")]
             for task in TASKS:
                 group = by_task.get(task)
-                row.append(_own(group, metric) if group else word("-"))
+                row.append(_mean(group, metric, f" ({about(group)})") if group else word("-"))
             yield row
 
 
-def _own(group: Group, metric: str) -> Cell:
+def _mean(group: Group, metric: str, after: str) -> Cell:
     values = group.values(metric)
-    return spread(float(values.mean()), stats.deviation(values), f" ({about(group)})")
+    return spread(float(values.mean()), stats.deviation(values), after)
 
 
 def published(comparison: Comparison) -> Table | None:
@@ -94,26 +94,17 @@ def published(comparison: Comparison) -> Table | None:
     for group in comparison.groups:
         task, version = split(group.env)
         if any(task in source["returns"] for source in sources()):
-            values = group.values(comparison.metric)
-            mean = spread(float(values.mean()), stats.deviation(values), f" ({version})")
-            alike = len(group.budgets) == 1
-            budget = count(group.budgets[0]) if alike else word("mixed")
-            row = [word(task), word(group.name), mean, word(f"{comparison.metric}, seeds")]
-            rows.append([*row, number(len(values)), budget, word("ours")])
+            row = [_mean(group, comparison.metric, f" ({version})")]
+            row += [word(f"{comparison.metric}, seeds"), number(len(group.runs))]
+            budget = count(group.budgets[0]) if len(group.budgets) == 1 else word("mixed")
+            rows.append([word(task), word(group.name), *row, budget, word("ours")])
             used.append(group)
     for task in dict.fromkeys(split(group.env)[0] for group in used):
         rows += [row for source in sources() for row in _rows(source, task, comparison.budget)]
     if not used:
         return None
-    headers = [
-        "task",
-        "algorithm",
-        "return (env version)",
-        "metric, ± over",
-        "n",
-        "steps",
-        "source",
-    ]
+    headers = ["task", "algorithm", "return (env version)", "metric, ± over"]
+    headers += ["n", "steps", "source"]
     notes = [
         "Published numbers with the env version, budget and metric of their source. Only "
         "HalfCheetah has the same dynamics from v2 to v5; a maximum is inflated, a training return "

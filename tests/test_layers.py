@@ -1,0 +1,17 @@
+"""What a study is must not depend on how it is shown: arrows between folders go one way."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import pacesetter
+
+PACKAGE = Path(pacesetter.__file__).parent
+
+
+@pytest.mark.parametrize("folder", [path.name for path in PACKAGE.iterdir() if path.is_dir()])
+def test_only_the_command_imports_the_command(folder: str) -> None:
+    files = [] if folder == "cli" else list((PACKAGE / folder).rglob("*.py"))
+    pattern = re.compile(r"^\s*(from|import) pacesetter\.cli\b", re.MULTILINE)
+    assert [path.name for path in files if pattern.search(path.read_text())] == []
