@@ -29,9 +29,8 @@ from pacesetter.learner.compiled import Cycle, Population
 from pacesetter.learner.normalizer import Normalizer, Statistics
 from pacesetter.policy import Policy, clip, normalize
 from pacesetter.process import threads
-from pacesetter.replay.buffer import Replay, Sample
-from pacesetter.replay.n_step import Pending
-from pacesetter.replay.priorities import choose
+from pacesetter.replay.buffer import Replay, Sample, make_sampler
+from pacesetter.replay.n_step import NStepQueue
 from pacesetter.seeding import Stream, generator
 from pacesetter.types import Floats
 
@@ -61,7 +60,7 @@ class Ensemble:
         self.horizon = (hyper.replay_horizon or 0) * config.unit  # 0 where there are no weights
         self.replays: list[Replay] = []
         self.workers = ThreadPoolExecutor(min(run.members, threads()))
-        self.pending = [Pending(hyper.n_step) for _ in range(run.members)]
+        self.pending = [NStepQueue(hyper.n_step) for _ in range(run.members)]
         self.kept: list[Policy | None] = [None] * run.members  # the best assessed policies
         self.warmup_streams = [generator(run.seed, Stream.WARMUP, k) for k in range(run.members)]
         self.act_streams = [generator(run.seed, Stream.ACT, k) for k in range(run.members)]
@@ -81,8 +80,8 @@ class Ensemble:
         size = self.config.hyper.replay_size
         for i in range(count):
             path = folder / f"replay-{i}.bin"
-            drawing = choose(self.config.hyper, min(size, self.budget))
-            self.replays.append(Replay(path, self.layout, size, self.budget, drawing))
+            sampler = make_sampler(self.config.hyper, min(size, self.budget))
+            self.replays.append(Replay(path, self.layout, size, self.budget, sampler))
 
     @property
     def streams(self) -> list[np.random.Generator]:
@@ -205,7 +204,7 @@ class Ensemble:
         run, progress, member = self.config.run, self.progress, self.progress.members[k]
         progress.episodes += 1
         progress.ended.append([k, member.episode_return, member.episode_length])
-        self.replay(k).drawing.end(k, member.episode_return)
+        self.replay(k).sampler.end(k, member.episode_return)
         learned = member.started >= self.config.hyper.warmup
         selects = run.members > 1 and run.select_on == "train"
         begun = max(self.config.select_after, member.copied)
@@ -229,7 +228,7 @@ class Ensemble:
         """Give up a running episode that cannot be entered again; its rows stay."""
         for row in self.pending[k].flush():
             self.replay(k).add(row, k)
-        self.replay(k).drawing.end(k, None)
+        self.replay(k).sampler.end(k, None)
         self.progress.members[k].abandon()
 
     # Learn.

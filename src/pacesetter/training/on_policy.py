@@ -25,7 +25,7 @@ from pacesetter.learner.compiled import Population
 from pacesetter.learner.normalizer import Normalizer, Statistics
 from pacesetter.policy import Policy, clip, normalize
 from pacesetter.replay.buffer import Replay
-from pacesetter.replay.n_step import Pending
+from pacesetter.replay.n_step import NStepQueue
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings import ModelDriven
 from pacesetter.training.sources import AllSteps, LastRollout
@@ -58,7 +58,7 @@ class Iterations:
         self.loss_names = self.population.loss_names(self.states[0], *self.source.shape())
         self.normalizer = Normalizer(spec.observation_size)
         self.budget = run.steps
-        self.pending: list[Pending] = []
+        self.pending: list[NStepQueue] = []
         self.kept: list[Policy | None] = [None]  # nothing is assessed
         self.memory = [self.algorithm.start_episode(self.acting[0], rng) for rng in self.streams]
         self.progress = Progress.of(len(envs))
@@ -169,5 +169,5 @@ class Iterations:
         progress.updates += 1
         progress.transitions += int(extra.get("valid", len(rows)))
         if self.population.normalize:
-            for row in rows:
-                self.normalizer.add(row[: self.layout.spec.observation_size])
+            for row in self.layout.unpack(rows).observation:
+                self.normalizer.add(row)
