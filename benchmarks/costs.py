@@ -31,20 +31,20 @@ from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs")
 reports = iter(trainer)
 next(reports)  # the evaluation at step 0, of ten episodes
-trainer.ensemble.tick()
+trainer.loop.tick()
 """
 FIRST_UPDATE = """
 from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs", warmup=2)
 while not trainer.progress.updates:
-    trainer.ensemble.tick()
+    trainer.loop.tick()
 """
 
 
 def outside(folder: str) -> None:
     """Share of a run's time that is spent outside the compiled update, checkpoints included."""
     trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1000, **QUIET)
-    population, spent, marks = trainer.ensemble.population, [0.0], []
+    population, spent, marks = trainer.loop.learners.compiled, [0.0], []
     update = population.update
 
     def watched(*arguments: Any) -> Any:
@@ -116,7 +116,7 @@ def over(found: list[float], others: list[float]) -> float:
 def checkpoint(folder: str) -> None:
     """Share of a minute that its checkpoint takes, Humanoid, 1M rows in the replay."""
     trainer = Trainer("td3", "Humanoid-v5", runs=folder, steps=10**7, **QUIET)
-    (replay,), rng = trainer.ensemble.replays, np.random.default_rng(0)
+    (replay,), rng = trainer.loop.replays, np.random.default_rng(0)
     while replay.head < 1_000_000:
         replay.rows[replay.head : replay.head + 25_000] = rng.random(replay.columns.width)
         replay.head += 25_000
@@ -159,7 +159,7 @@ def memory(folder: str) -> None:
     for report in trainer:
         if report.kind == "train" and report.step == 1_002_000:
             full = resident()
-            rows = trainer.ensemble.replays[0].columns.width * 4 * 1_000_000 / MEGA
+            rows = trainer.loop.replays[0].columns.width * 4 * 1_000_000 / MEGA
             print(f"memory: {full - rows:.0f} MB beyond {rows:.0f} MB of rows (target 700)")
         if report.step >= 1_202_000:
             break

@@ -106,8 +106,8 @@ def updates_per_step(sizes: list[int]) -> Iterator[Point]:
                 eval_episodes=1, updates_per_step=size,
             )  # fmt: skip
             for _ in range(100):
-                trainer.ensemble.tick()
-            took = median(timed(trainer.ensemble.tick, 100) for _ in range(3))
+                trainer.loop.tick()
+            took = median(timed(trainer.loop.tick, 100) for _ in range(3))
             floor = size * work / median(best() for _ in range(3))
             trainer.close()
         yield Point("updates a step", size, "step", took, floor)

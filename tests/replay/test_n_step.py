@@ -109,8 +109,8 @@ def test_rows_of_a_run_lead_over_their_steps(runs: Path) -> None:
     trainer = Trainer(
         "multi-td3", "probe_envs:Corridor-v0", runs=runs, env_kwargs={"falls_at": 4}, **settings
     )
-    ensemble = trainer.ensemble
-    replay = ensemble.replays[0]
+    loop = trainer.loop
+    replay = loop.replays[0]
     run_to_end(trainer)
     assert replay.head == 16
     flat = np.fromfile(replay.path, np.float32).reshape(-1, ensemble.layout.width)

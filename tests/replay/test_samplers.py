@@ -367,7 +367,7 @@ def test_cycles_of_all_members_are_drawn_before_any_error_returns(runs: Path) ->
     """One replay for both: sample, sample, feedback, feedback."""
     settings: dict[str, Any] = {**TINY, "warmup": 20, "steps": 60, "replay": "prioritized"}
     trainer = Trainer("multi-td3", CORRIDOR, runs=runs, env_kwargs={"cut_at": 10}, **settings)
-    sampler, calls = trainer.ensemble.replays[0].sampler, list[str]()
+    sampler, calls = trainer.loop.replays[0].sampler, list[str]()
     sample, feedback = sampler.sample, sampler.feedback
 
     def watched_sample(*words: Any) -> Any:
@@ -392,7 +392,7 @@ def test_horizon_is_set_at_the_start(runs: Path) -> None:
     trainer = Trainer.resume(trainer.directory.path, steps=400)
     assert trainer.directory.settings()["replay_horizon"] == 200
     seen: list[float] = []
-    replay = trainer.ensemble.replays[0]
+    replay = trainer.loop.replays[0]
     sample = replay.sample
 
     def watched(rng: Any, shape: Any, done: float) -> Any:

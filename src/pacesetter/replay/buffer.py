@@ -115,6 +115,8 @@ class Replay:
         first = self._first_block()
         return {"head": self.head, "blocks": [first, *self.hashes[first:]], "tail": tail}
 
+    table = commit  # as the part of a checkpoint that it is
+
     def restore(self, table: dict[str, Any], arrays: Arrays | None = None) -> None:
         """Take up the ring where a checkpoint left it, or refuse rows that are not its own."""
         self.head = self.committed = int(table["head"])

@@ -30,11 +30,14 @@ class NStepQueue:
         return rows
 
     def arrays(self) -> Arrays:
-        """The waiting rows, field by field."""
+        """The waiting transitions, field by field."""
         fields = zip(Transition._fields, zip(*self.rows, strict=True), strict=False)
         return {name: np.array(values) for name, values in fields if values[0] is not None}
 
-    def restore(self, arrays: Arrays) -> None:
+    def table(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays`."""
         columns: list[Any] = list(arrays.values())
         rows = zip(*columns, strict=True)
