@@ -38,7 +38,7 @@ def time_alone(settings: Settings, rows: int, repeats: int) -> tuple[float, floa
     from pacesetter.replay.buffer import make_sampler
     from pacesetter.settings import OffPolicy
 
-    rng, drawing = np.random.default_rng(0), make_sampler(OffPolicy(**settings), rows)
+    rng, sampler = np.random.default_rng(0), make_sampler(OffPolicy(**settings), rows)
     for number in range(rows):
         sampler.add(number, 0, 0.0)
         if number % EPISODE == EPISODE - 1:

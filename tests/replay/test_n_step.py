@@ -113,8 +113,8 @@ def test_rows_of_a_run_lead_over_their_steps(runs: Path) -> None:
     replay = loop.replays[0]
     run_to_end(trainer)
     assert replay.head == 16
-    flat = np.fromfile(replay.path, np.float32).reshape(-1, ensemble.layout.width)
-    rows = ensemble.layout.unpack(flat[:8])
+    flat = np.fromfile(replay.path, np.float32).reshape(-1, loop.learners.compiled.layout.width)
+    rows = loop.learners.compiled.layout.unpack(flat[:8])
     np.testing.assert_array_equal(rows.observation[:, 0], [0, 0, 1, 2, 3, 1, 2, 3])
     np.testing.assert_array_equal(rows.next_observation[:, 0], [3, 3, 4, 4, 4, 4, 4, 4])
     np.testing.assert_array_equal(rows.reward, [1.75, 1.75, 1.75, 1.5, 1, 1.75, 1.5, 1])

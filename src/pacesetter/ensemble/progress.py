@@ -60,7 +60,7 @@ class Progress:
     @property
     def step(self) -> int:
         """Env steps so far, of all members and, where it is counted, of selection."""
-        members = sum(member.steps for member in self.members)
+        members = sum([member.steps for member in self.members])  # a list is quicker here
         return members + self.selection_steps - self.free_steps
 
     def arrays(self) -> Arrays:
