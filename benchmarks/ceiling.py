@@ -23,10 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.batch import Spec
+from pacesetter.batch import Layout, Spec
 from pacesetter.config import resolve
-from pacesetter.learner.compiled import Population
-from pacesetter.replay.buffer import Columns
+from pacesetter.learner.compiled import CompiledLearner
 
 SPECS = {"HalfCheetah-v5": Spec(17, 6), "Ant-v5": Spec(105, 8), "Humanoid-v5": Spec(348, 17)}
 TARGETS = {("td3", 1, 1): 0.82, ("td3", 2, 1): 0.7, ("td3", 2, 2): 0.75}  # cores, members
@@ -93,14 +92,14 @@ def whole(
     """A cycle of every member as training calls it, its products, and its updates."""
     config = resolve(name, "HalfCheetah-v5", settings)
     algorithm = algorithms.find(config.run.algorithm).build(spec, config.hyper)
-    columns = Columns(*spec, len(algorithm.mask(np.random.default_rng(0))))
+    layout = Layout(spec, len(algorithm.mask(np.random.default_rng(0))))
     hyper = config.hyper
-    population = Population(algorithm, columns, 0, hyper.normalize_observation, hyper.precision)
-    states = population.init(members, same=False)
-    size = (algorithm.updates_per_call, config.hyper.batch_size, columns.width)
+    compiled = CompiledLearner(algorithm, layout, 0, hyper.normalize_observation, hyper.precision)
+    states = compiled.init(members, same=False)
+    size = (algorithm.updates_per_call, config.hyper.batch_size, layout.width)
     rows = np.random.default_rng(0).normal(size=size).astype(np.float32)
     still = np.zeros(spec.observation_size, np.float32), np.ones(spec.observation_size, np.float32)
-    batch = columns.unpack(jnp.asarray(rows), None)
+    batch = layout.unpack(jnp.asarray(rows))._replace(weight=jnp.ones(rows.shape[:-1]))
     traced = jax.make_jaxpr(algorithm.update)(states[0], batch, jax.random.key(0))
     counts: Counter[Product] = Counter()
     for product, times in products(traced.jaxpr):
@@ -110,7 +109,7 @@ def whole(
     run = map if members == 1 else workers.map
 
     def one(state: Any, member: int) -> Any:
-        return population.update(state, member, 0, rows, None, still).state
+        return compiled.update(state, member, 0, rows, None, still).state
 
     def call() -> Any:
         states[:] = run(one, states, range(members))

@@ -31,21 +31,21 @@ from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs")
 reports = iter(trainer)
 next(reports)  # the evaluation at step 0, of ten episodes
-trainer.ensemble.tick()
+trainer.loop.tick()
 """
 FIRST_UPDATE = """
 from pacesetter import Trainer
 trainer = Trainer("td3", "HalfCheetah-v5", runs="runs", warmup=2)
 while not trainer.progress.updates:
-    trainer.ensemble.tick()
+    trainer.loop.tick()
 """
 
 
 def outside(folder: str) -> None:
     """Share of a run's time that is spent outside the compiled update, checkpoints included."""
     trainer = Trainer("td3", ENV, runs=folder, steps=10**7, warmup=1000, **QUIET)
-    population, spent, marks = trainer.ensemble.population, [0.0], []
-    update = population.update
+    compiled, spent, marks = trainer.loop.learners.compiled, [0.0], []
+    update = compiled.update
 
     def watched(*arguments: Any) -> Any:
         began = perf_counter()
@@ -54,7 +54,7 @@ def outside(folder: str) -> None:
         finally:
             spent[0] += perf_counter() - began
 
-    population.update = watched
+    compiled.update = watched
     for report in trainer:
         if report.kind == "train" and report.step >= 2000:
             marks.append((perf_counter(), spent[0]))
@@ -116,15 +116,15 @@ def over(found: list[float], others: list[float]) -> float:
 def checkpoint(folder: str) -> None:
     """Share of a minute that its checkpoint takes, Humanoid, 1M rows in the replay."""
     trainer = Trainer("td3", "Humanoid-v5", runs=folder, steps=10**7, **QUIET)
-    (replay,), rng = trainer.ensemble.replays, np.random.default_rng(0)
+    (replay,), rng = trainer.loop.replays, np.random.default_rng(0)
     while replay.head < 1_000_000:
-        replay.rows[replay.head : replay.head + 25_000] = rng.random(replay.columns.width)
+        replay.rows[replay.head : replay.head + 25_000] = rng.random(replay.layout.width)
         replay.head += 25_000
         trainer.save()
     took: list[float] = []
     for _ in range(5):
         for number in range(replay.head, replay.head + 12_000):  # more than a minute's steps
-            replay.rows[number % replay.slots] = rng.random(replay.columns.width)
+            replay.rows[number % replay.slots] = rng.random(replay.layout.width)
         replay.head += 12_000
         began = perf_counter()
         trainer.save()
@@ -159,7 +159,7 @@ def memory(folder: str) -> None:
     for report in trainer:
         if report.kind == "train" and report.step == 1_002_000:
             full = resident()
-            rows = trainer.ensemble.replays[0].columns.width * 4 * 1_000_000 / MEGA
+            rows = trainer.loop.replays[0].layout.width * 4 * 1_000_000 / MEGA
             print(f"memory: {full - rows:.0f} MB beyond {rows:.0f} MB of rows (target 700)")
         if report.step >= 1_202_000:
             break

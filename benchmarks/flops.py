@@ -14,9 +14,8 @@ import numpy as np
 from tabulate import tabulate
 
 from pacesetter import algorithms
-from pacesetter.batch import Spec
+from pacesetter.batch import Layout, Spec
 from pacesetter.envs import Environment
-from pacesetter.replay.buffer import Columns
 from pacesetter.seeding import Stream
 
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -37,11 +36,13 @@ def megaflops(name: str, spec: Spec, **settings: Any) -> float:
     hyper = kind.Hyper(**settings)
     learner = kind.build(spec, hyper)
     masks = len(learner.mask(np.random.default_rng()))
-    columns, key = Columns(*spec, masks), jax.random.key(0)
-    rows = np.zeros((learner.updates_per_call, hyper.batch_size, columns.width), np.float32)
+    layout, key = Layout(spec, masks), jax.random.key(0)
+    rows = np.zeros((learner.updates_per_call, hyper.batch_size, layout.width), np.float32)
 
     def update(state: Any, rows: Any) -> Any:
-        return learner.update(state, columns.unpack(rows, None), key)
+        return learner.update(
+            state, layout.unpack(rows)._replace(weight=np.ones(rows.shape[:-1], np.float32)), key
+        )
 
     compiled = jax.jit(update).lower(jax.eval_shape(learner.init, key), rows).compile()
     analysis: Any = compiled.cost_analysis()

@@ -21,8 +21,8 @@ from ceiling import TOGETHER, alone, flops, timed, whole
 from tabulate import tabulate
 
 from pacesetter import Trainer
-from pacesetter.batch import Spec
-from pacesetter.replay.buffer import Columns, Replay
+from pacesetter.batch import Layout, Spec
+from pacesetter.replay.buffer import Replay
 
 matplotlib.use("Agg")
 SQUARE = ((256, 256), (256, 256), (((1,), (0,)), ((), ())))
@@ -86,7 +86,7 @@ def replay(sizes: list[int]) -> Iterator[Point]:
     rng = np.random.default_rng(0)
     for size in sizes:
         with TemporaryDirectory() as folder:
-            ring = Replay(Path(folder) / "ring", Columns(*CHEETAH), size, size)
+            ring = Replay(Path(folder) / "ring", Layout(CHEETAH), size, size)
             ring.rows[:] = 1.0
             ring.head = size
             took = median(timed(lambda r=ring: r.sample(rng, (256,)), 200) for _ in range(5))
@@ -106,8 +106,8 @@ def updates_per_step(sizes: list[int]) -> Iterator[Point]:
                 eval_episodes=1, updates_per_step=size,
             )  # fmt: skip
             for _ in range(100):
-                trainer.ensemble.tick()
-            took = median(timed(trainer.ensemble.tick, 100) for _ in range(3))
+                trainer.loop.tick()
+            took = median(timed(trainer.loop.tick, 100) for _ in range(3))
             floor = size * work / median(best() for _ in range(3))
             trainer.close()
         yield Point("updates a step", size, "step", took, floor)

@@ -35,23 +35,23 @@ START = 2_000  # steps before the clock starts: warm-up, compilation, settling
 
 def time_alone(settings: Settings, rows: int, repeats: int) -> tuple[float, float]:
     """Median CPU microseconds of drawing and of feeding back, from a full ring."""
-    from pacesetter.replay.priorities import choose
+    from pacesetter.replay.buffer import make_sampler
     from pacesetter.settings import OffPolicy
 
-    rng, drawing = np.random.default_rng(0), choose(OffPolicy(**settings), rows)
+    rng, sampler = np.random.default_rng(0), make_sampler(OffPolicy(**settings), rows)
     for number in range(rows):
-        drawing.add(number, 0, 0.0)
+        sampler.add(number, 0, 0.0)
         if number % EPISODE == EPISODE - 1:
-            drawing.end(0, rng.normal())
+            sampler.end(0, rng.normal())
     window = range(rows)
     marks: list[list[float]] = [[], []]
     for _ in range(repeats):
         began = process_time()
-        numbers = drawing.draw(rng, SHAPE, window, 0.5).numbers
+        numbers = sampler.sample(rng, SHAPE, window, 0.5).numbers
         drawn = process_time()
         error = rng.exponential(size=SHAPE).astype(np.float32)
         fed = process_time()
-        drawing.feedback(numbers, error)
+        sampler.feedback(numbers, error)
         marks[0].append(drawn - began)
         marks[1].append(process_time() - fed)
     return median(marks[0]) * 1e6, median(marks[1]) * 1e6

@@ -211,18 +211,18 @@ def test_env_that_does_not_repeat_is_reported(runs: Any) -> None:
     """The run says so, starts a new episode, and goes on."""
     settings = {**TINY, "steps": 260, "warmup": 250, "name": "restless"}
     trainer = Trainer("td3", f"broken_envs:{Restless.__name__}-v0", runs=runs, **settings)
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def tick_and_stop() -> Any:
         trainer.stop()
         return tick()
 
-    trainer.ensemble.tick = tick_and_stop
+    trainer.loop.tick = tick_and_stop
     run_to_end(trainer)
     assert trainer.progress.step == 1
     resumed = Trainer.resume(trainer.directory.path)
     (note,) = resumed.notes
-    assert "member 0" in note
+    assert "env 0" in note
     assert "Restless-v0 does not repeat" in note
     assert "\n" not in note
     *_, last = resumed
@@ -233,14 +233,14 @@ def test_env_that_remembers_earlier_episodes_is_reported(runs: Any) -> None:
     """The observations repeat, but what the episode earned does not."""
     settings = {**TINY, "steps": 260, "warmup": 260, "eval_every": 260, "name": "ageing"}
     trainer = Trainer("td3", "broken_envs:Ageing-v0", runs=runs, **settings)
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def tick_and_stop() -> Any:
         if trainer.progress.step == 150:
             trainer.stop()
         return tick()
 
-    trainer.ensemble.tick = tick_and_stop
+    trainer.loop.tick = tick_and_stop
     run_to_end(trainer)
     resumed = Trainer.resume(trainer.directory.path)
     resumed.close()

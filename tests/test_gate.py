@@ -11,8 +11,8 @@ import pytest
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
 from pacesetter.config import resolve
-from pacesetter.learner.backend import IN_PLACE, compiler_options, prepare
-from pacesetter.learner.compiled import Population
+from pacesetter.learner.backend import prepare
+from pacesetter.learner.compiled import CompiledLearner
 from pacesetter.training.trainer import Trainer
 
 HALF_CHEETAH = Spec(17, 6)
@@ -28,12 +28,12 @@ def costs(name: str) -> dict[str, float]:
     config = resolve(name, "HalfCheetah-v5")
     algorithm = algorithms.find(name).build(HALF_CHEETAH, config.hyper)
     layout = Layout(HALF_CHEETAH)
-    population = Population(algorithm, layout, 0, normalize=False)
+    compiled = CompiledLearner(algorithm, layout, 0, normalize=False)
     state = jax.eval_shape(algorithm.init, jax.random.key(0))
     rows = jax.ShapeDtypeStruct((algorithm.updates_per_call, 256, layout.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
     key = np.zeros(2, np.uint32)
-    lowered = population._update.lower(state, rows, None, still, {}, key)
+    lowered = compiled._update.lower(state, rows, None, still, {}, {}, key)
     found: Any = lowered.compile().cost_analysis()
     return {key: found[key] / algorithm.updates_per_call for key in ("flops", "bytes accessed")}
 
@@ -83,7 +83,7 @@ def test_nothing_is_compiled_after_the_first_round(tmp_path: Path) -> None:
             watching = watching or report.kind == "select"
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    assert trainer.progress.selections > 3
+    assert trainer.loop.selector.selections > 3
     assert compiled, "nothing was seen to be compiled at all"
     assert not any(compiled)
 
@@ -93,9 +93,9 @@ def test_python_calls_of_a_step(tmp_path: Path) -> None:
     trainer = Trainer(
         "td3", "HalfCheetah-v5", runs=tmp_path, warmup=20, hidden=(8,), batch_size=8, steps=10**4
     )
-    ensemble, calls = trainer.ensemble, 0
+    loop, calls = trainer.loop, 0
     for _ in range(30):
-        ensemble.tick()
+        loop.tick()
 
     def count(frame: Any, event: str, argument: Any) -> None:
         nonlocal calls
@@ -104,17 +104,8 @@ def test_python_calls_of_a_step(tmp_path: Path) -> None:
     sys.setprofile(count)
     try:
         for _ in range(100):
-            ensemble.tick()
+            loop.tick()
     finally:
         sys.setprofile(None)
     trainer.close()
     assert calls / 100 <= CALLS
-
-
-def test_updates_are_compiled_without_an_option_that_this_xla_does_not_know(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Options of XLA come and go with its releases; one that is gone is left out."""
-    assert compiler_options() == IN_PLACE
-    monkeypatch.setattr("pacesetter.learner.backend.IN_PLACE", {"xla_cpu_no_such_option": True})
-    assert compiler_options() is None

@@ -58,25 +58,24 @@ class Layout:
             "last": (),
             "mask": (masks,),
         }
-        self._ends = np.cumsum([math.prod(shape) for shape in self.shapes.values()]).tolist()
-
-    @property
-    def width(self) -> int:
-        """Numbers in a row."""
-        return self._ends[-1]
+        ends: list[int] = np.cumsum([math.prod(shape) for shape in self.shapes.values()]).tolist()
+        self.width = ends[-1]  # numbers in a row
+        self._places = {
+            name: slice(start, end)
+            for name, start, end in zip(self.shapes, [0, *ends], ends, strict=False)
+        }
 
     def pack(self, transition: Transition) -> Floats:
         """The row (width,) of one transition."""
-        parts = [np.ravel(getattr(transition, name)) for name in self.shapes]
-        return np.concatenate(parts, dtype=np.float32, casting="same_kind")
+        row = np.empty(self.width, np.float32)
+        for name, place in self._places.items():
+            row[place] = getattr(transition, name)
+        return row
 
     def unpack(self, rows: Any) -> Transition:
         """The transitions in rows (..., width), of NumPy or of JAX, without weights."""
-        starts = [0, *self._ends]
         parts = {
-            name: rows[..., first:end].reshape(*rows.shape[:-1], *shape)
-            for (name, shape), first, end in zip(
-                self.shapes.items(), starts, self._ends, strict=False
-            )
+            name: rows[..., place].reshape(*rows.shape[:-1], *self.shapes[name])
+            for name, place in self._places.items()
         }
         return Transition(**parts)

@@ -249,7 +249,7 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
     settings = {**TINY, "critic_hidden": (16, 16), "warmup": 20, "steps": 80, "renorm_after": 30}
     trainer = Trainer("crossq", "probe_envs:Scripted-v0", runs=runs, **settings)
     assert run_to_end(trainer).rows()[-1]["step"] == 80
-    assert trainer.ensemble.states[0].updates == 60
+    assert trainer.loop.learners.states[0].updates == 60
 
 
 # What acts, and the presets.

@@ -258,15 +258,15 @@ def test_ring_is_given_whole(tmp_path: Path) -> None:
 
 def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The data of each update."""
-    population: Any = trainer.ensemble.population
+    compiled: Any = trainer.loop.learners.compiled
     seen: list[Any] = []
-    update = population.update
+    update = compiled.update
 
     def spy(state: Any, member: int, tick: int, rows: Any, *rest: Any) -> Any:
         seen.append((rows.copy(), rest[-1]))
         return update(state, member, tick, rows, *rest)
 
-    monkeypatch.setattr(population, "update", spy)
+    monkeypatch.setattr(compiled, "update", spy)
     return seen
 
 
@@ -440,11 +440,11 @@ def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
     trainer = Trainer("me-trpo", "Hopper-v5", runs=tmp_path, steps=750, **RUN)
     searched = fitted = 0.0
     while not trainer.finished:
-        trainer.ensemble.tick()
-        told = trainer.progress.training_values(trainer.ensemble.loss_names)
+        trainer.loop.tick()
+        told = trainer.loop.training_values()
         searched += told["policy_updates"]
         fitted += told["model_epochs"]
-    found = trainer.ensemble.ledger()
+    found = trainer.loop.ledger()
     trainer.close()
     assert found["updates"] == 3
     assert found["resets"] == 3 * SMALL["starts"]

@@ -95,9 +95,9 @@ def learn(
 
 def values(trainer: Trainer, observation: float, actions: Any = (-0.8, 0.0, 0.8)) -> Any:
     """Every critic's value (..., critics, actions) of actions in [-1, 1]."""
-    critic = jax.device_get(trainer.ensemble.states[0].critic)
+    critic = jax.device_get(trainer.loop.learners.states[0].critic)
     action = np.array(actions, np.float32)[:, None]
-    algorithm: Any = trainer.ensemble.algorithm
+    algorithm: Any = trainer.loop.learners.compiled.learner
     ask = algorithm.values if hasattr(algorithm, "values") else members_values(algorithm)
     return jax.jit(ask)(critic, np.full_like(action, observation), action)
 
@@ -219,12 +219,12 @@ def stored(env: str, runs: Path, steps: int, **settings: Any) -> Any:
     """All transitions of a run that does not learn."""
     settings = {**TINY, "steps": steps, "updates_per_step": 1e-9, **settings}
     trainer = Trainer("td3", f"probe_envs:{env}", runs=runs, **settings)
-    ensemble = trainer.ensemble
-    replay = ensemble.replays[0]
+    loop = trainer.loop
+    replay = loop.replays[0]
     run_to_end(trainer)
     path = replay.path
-    rows = np.fromfile(path, np.float32).reshape(-1, ensemble.layout.width)[:steps]
-    return jax.device_get(ensemble.layout.unpack(rows))
+    rows = np.fromfile(path, np.float32).reshape(-1, loop.learners.compiled.layout.width)[:steps]
+    return jax.device_get(loop.learners.compiled.layout.unpack(rows))
 
 
 @pytest.mark.parametrize(

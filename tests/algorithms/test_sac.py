@@ -211,7 +211,7 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
     settings = {**TINY, "warmup": 20, "steps": 80}
     trainer = Trainer("multi-sac", "probe_envs:Scripted-v0", runs=runs, **settings)
     assert run_to_end(trainer).rows()[-1]["step"] == 80
-    assert all(state.updates >= 20 for state in trainer.ensemble.states)
+    assert all(state.updates >= 20 for state in trainer.loop.learners.states)
 
 
 # What acts.

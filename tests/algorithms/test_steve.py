@@ -183,7 +183,7 @@ def test_a_whole_run_without_horizon_is_td3(runs: Path) -> None:
         for trainer in (steve, plain)
     ]
     assert scores[0] == scores[1]
-    assert_equal_networks(steve.ensemble.states[0], plain.ensemble.states[0])
+    assert_equal_networks(steve.loop.learners.states[0], plain.loop.learners.states[0])
 
 
 def test_several_members_without_horizon_share_the_mean_target() -> None:

@@ -417,7 +417,7 @@ def test_ledger_and_log_of_a_run(name: str, runs: Path) -> None:
     """Ensemble updates, passes of the bounds, stored masks and the histogram."""
     settings = {**TINY, "hidden": (8,), "steps": 300, "ensemble": 3}
     trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
-    layout, path = trainer.ensemble.layout, trainer.ensemble.replays[0].path
+    layout, path = trainer.loop.learners.compiled.layout, trainer.loop.replays[0].path
     last = run_to_end(trainer).rows()[-1]
     assert last["updates"] in (199, 200, 198)
     assert last["ensemble_updates"] == 3 * last["updates"]
@@ -445,14 +445,14 @@ def test_official_updates_come_in_blocks(runs: Path) -> None:
     }
     trainer = Trainer("sunrise", "probe_envs:Scripted-v0", runs=runs, **settings)
     seen: list[int] = []
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def watched() -> Any:
         found = tick()
         seen.append(trainer.progress.updates)
         return found
 
-    trainer.ensemble.tick = watched
+    trainer.loop.tick = watched
     run_to_end(trainer)
     assert seen == [0] * 39 + [30] * 40 + [70] * 40 + [110]
 
@@ -464,13 +464,13 @@ def test_blocks_longer_than_a_tick_are_made_whole(
     small = {"hidden": (8,), "steps": 120, "warmup": 10, "ensemble": 2, "update_every": 40}
     states: list[Any] = []
     for name, longest in (("whole", 500), ("parts", 7)):
-        monkeypatch.setattr(members, "LONGEST", longest)
+        monkeypatch.setattr(members, "MAX_CALLS_PER_TICK", longest)
         trainer = Trainer(
             "sunrise", "probe_envs:Scripted-v0", runs=runs, name=name, **{**TINY, **small}
         )
         run_to_end(trainer)
         assert trainer.progress.updates == 110
-        states.append(jax.device_get(trainer.ensemble.states))
+        states.append(jax.device_get(trainer.loop.learners.states))
     pairs = zip(*map(jax.tree.leaves, states), strict=True)
     assert all(np.array_equal(a, b) for a, b in pairs)
 
@@ -522,7 +522,7 @@ def test_nothing_is_nan(name: str, reference: Any, runs: Path, nans_raise: None)
     settings["reference"] = reference
     trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
     assert run_to_end(trainer).rows()[-1]["step"] == 80
-    assert np.all(trainer.ensemble.states[0].updates == 60)
+    assert np.all(trainer.loop.learners.states[0].updates == 60)
 
 
 @both

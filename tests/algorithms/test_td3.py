@@ -542,15 +542,15 @@ def test_ou_memory_is_reset_where_an_episode_starts(runs: Path) -> None:
         exploration="ou",
         updates_per_step=1e-9,
     )
-    ensemble = trainer.ensemble
-    ensemble.envs[0].env.unwrapped.length = 4
-    explore, seen = ensemble._explore, []
+    loop = trainer.loop
+    loop.explorers[0].env.env.unwrapped.length = 4
+    step, seen = loop._step, []
 
-    def watched(k: int) -> Any:
-        seen.append((not ensemble.envs[k].actions, np.copy(ensemble.memory[k])))
-        return explore(k)
+    def watched(k: int) -> None:
+        seen.append((not loop.explorers[k].env.actions, np.copy(loop.explorers[k].noise_state)))
+        step(k)
 
-    ensemble._explore = watched
+    loop._step = watched
     run_to_end(trainer)
     assert len(seen) == 100
     assert sum(start for start, _ in seen) == 18  # 50 / 4 and 50 / 10, rounded up
@@ -630,7 +630,7 @@ def test_nothing_is_nan(name: str, settings: dict[str, Any], runs: Path, nans_ra
     settings = {**TINY, "warmup": 20, "steps": 80, **settings}
     trainer = Trainer(name, "probe_envs:Scripted-v0", runs=runs, **settings)
     assert run_to_end(trainer).rows()[-1]["step"] == 80
-    assert all(state.updates >= 20 for state in trainer.ensemble.states)
+    assert all(state.updates >= 20 for state in trainer.loop.learners.states)
 
 
 # Learning a walker's task; in so few steps HalfCheetah is not learned with every seed.

@@ -324,10 +324,10 @@ def learn(env: str, runs: Path, **kwargs: Any) -> Trainer:
 
 
 def values(trainer: Trainer, *observations: float) -> Any:
-    mean, deviation = trainer.ensemble.statistics
+    mean, deviation = trainer.loop.normalizer.statistics()
     seen = (np.array(observations, np.float32)[:, None] - mean) / deviation
-    algorithm: Any = trainer.ensemble.algorithm
-    return algorithm.values(trainer.ensemble.states[0], jnp.array(seen))
+    algorithm: Any = trainer.loop.learners.compiled.learner
+    return algorithm.values(trainer.loop.learners.states[0], jnp.array(seen))
 
 
 def test_probe_constant_reward(runs: Path) -> None:
@@ -368,16 +368,16 @@ def test_probe_reward_of_the_action_that_fits_what_is_seen(runs: Path) -> None:
 
 def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
     """What the learner acts with, its rows and statistics, at each update."""
-    iterations: Any = trainer.ensemble
+    loop: Any = trainer.loop
     seen: list[tuple[Any, ...]] = []
-    update = iterations.population.update
+    update = loop.learners.compiled.update
 
     def spy(state: Any, member: int, tick: int, rows: Any, weight: Any, *rest: Any) -> Any:
         statistics, *_ = rest
-        seen.append((iterations.acting[0], rows.copy(), statistics))
+        seen.append((loop.learners.policy_params[0], rows.copy(), statistics))
         return update(state, member, tick, rows, weight, *rest)
 
-    monkeypatch.setattr(iterations.population, "update", spy)
+    monkeypatch.setattr(loop.learners.compiled, "update", spy)
     return seen
 
 
@@ -401,7 +401,7 @@ def test_rollout_follows_each_env_in_time(runs: Path, monkeypatch: pytest.Monkey
     seen = watch(trainer, monkeypatch)
     run_to_end(trainer)
     rows = np.concatenate([rows for _, rows, _ in seen])
-    batch = trainer.ensemble.layout.unpack(jnp.array(rows))
+    batch = trainer.loop.learners.compiled.layout.unpack(jnp.array(rows))
     np.testing.assert_array_equal(batch.observation[..., 0], np.arange(8)[:, None] % 3 * [1, 1, 1])
     np.testing.assert_array_equal(batch.next_observation[..., 0], batch.observation[..., 0] + 1)
     np.testing.assert_array_equal(batch.last, batch.next_observation[..., 0] == 3)
@@ -415,7 +415,7 @@ def test_actions_are_stored_uncut_and_done_cut(runs: Path, monkeypatch: pytest.M
     trainer = Trainer("trpo", "probe_envs:Echo-v0", runs=runs, env_kwargs=kwargs, **settings)
     ((_, rows, _),) = (seen := watch(trainer, monkeypatch), run_to_end(trainer))[0]
     assert len(seen) == 1
-    batch = trainer.ensemble.layout.unpack(jnp.array(rows))
+    batch = trainer.loop.learners.compiled.layout.unpack(jnp.array(rows))
     np.testing.assert_allclose(batch.action.std(), 2, atol=0.15)
     np.testing.assert_allclose(batch.next_observation, jnp.clip(batch.action, -1, 1), atol=1e-6)
 
@@ -428,8 +428,8 @@ def test_statistics_stay_during_an_iteration(runs: Path, monkeypatch: pytest.Mon
     run_to_end(trainer)
     streams = [np.random.Generator(np.random.PCG64(0)) for _ in range(3)]
     fresh = Trainer("trpo", "Hopper-v5", runs=runs, name="fresh", steps=240, **RUN)
-    for stream, rng in zip(streams, fresh.ensemble.streams, strict=True):
-        stream.bit_generator.state = rng.bit_generator.state
+    for stream, explorer in zip(streams, fresh.loop.explorers, strict=True):
+        stream.bit_generator.state = explorer.act_stream.bit_generator.state
     fresh.close()
     gathered: list[Any] = []
     for params, rows, (mean, deviation) in seen:
@@ -437,7 +437,7 @@ def test_statistics_stay_during_an_iteration(runs: Path, monkeypatch: pytest.Mon
             together = np.concatenate(gathered)
             np.testing.assert_allclose(mean, together.mean(axis=0), rtol=1e-4, atol=1e-5)
             np.testing.assert_allclose(deviation, together.std(axis=0), rtol=1e-3, atol=1e-3)
-        batch = trainer.ensemble.layout.unpack(jnp.array(rows))
+        batch = trainer.loop.learners.compiled.layout.unpack(jnp.array(rows))
         scaled = jnp.clip((batch.observation - mean) / deviation, -10, 10)
         middle, log_std = trust_region.distribution_of(trust_region.Gaussian(*params), scaled)
         noise = (batch.action - middle) / np.exp(log_std)

@@ -354,7 +354,7 @@ def halfway(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def stop_at(trainer: Trainer, step: int) -> None:
     """Run until so many steps are made, then end as a signal would."""
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def tick_and_stop() -> Any:
         selection = tick()
@@ -362,7 +362,7 @@ def stop_at(trainer: Trainer, step: int) -> None:
             trainer.stop()
         return selection
 
-    trainer.ensemble.tick = tick_and_stop
+    trainer.loop.tick = tick_and_stop
     run_to_end(trainer)
     assert trainer.progress.step == step
 

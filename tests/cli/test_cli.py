@@ -486,14 +486,14 @@ def test_eval_of_uniform_actions_and_longer_episodes(command: Command) -> None:
 def test_the_demo_saves_on_ctrl_c(runs: Path) -> None:
     """The first signal ends it after the running tick, with all saved."""
     trainer = Trainer("td3", PROBE, runs=runs, **{**TINY, "steps": 100_000})
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def interrupted() -> Any:
         if trainer.progress.step == 50:
             signal.raise_signal(signal.SIGINT)
         return tick()
 
-    trainer.ensemble.tick = interrupted
+    trainer.loop.tick = interrupted
     assert not demo.train(trainer)
     resumed = Trainer.resume(trainer.directory.path)
     resumed.close()

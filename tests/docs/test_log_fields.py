@@ -30,9 +30,9 @@ TASK = "probe_envs:Scripted-v0"
 
 def fields(runs: Path, algorithm: str) -> set[str]:
     """The names in all rows of a short run."""
-    from pacesetter.config import settle
+    from pacesetter.config import resolve
 
-    known = settle(algorithm, TASK).settings()
+    known = resolve(algorithm, TASK).settings()
     given = {name: value for name, value in TINY.items() if name in known} | SMALL
     trainer = Trainer(algorithm, TASK, runs=runs, **given, **RUNS[algorithm])
     return {name for row in run_to_end(trainer).rows() for name in row}

@@ -54,11 +54,11 @@ def test_policy_is_fixed_while_it_is_assessed(runs: Path) -> None:
     and then all that fell due.
     """
     trainer = assessed(runs, ([5, 4, 3],), steps=60)
-    before = jax.device_get(trainer.ensemble.states[0])
+    before = jax.device_get(trainer.loop.learners.states[0])
     seen: list[tuple[int, int, bool]] = []
     for report in trainer:
         if report.kind == "eval":
-            after = jax.device_get(trainer.ensemble.states[0])
+            after = jax.device_get(trainer.loop.learners.states[0])
             seen.append((report.step, trainer.progress.updates, same(before, after)))
             before = after
     assert seen == [
@@ -85,7 +85,7 @@ def test_the_kept_policy_is_what_is_evaluated(runs: Path) -> None:
     for policy in (trainer.policy(), load(trainer.directory.policy_file), resumed.policy()):
         np.testing.assert_array_equal(policy.act(np.ones(3)), first)
         assert (policy.about["kept_at"], policy.about["worst_return"]) == (20, 9)
-    assert np.any(resumed.ensemble.current(0).act(np.ones(3)) != first)
+    assert np.any(resumed.loop.current_policy(0).act(np.ones(3)) != first)
     resumed.close()
 
 
@@ -102,19 +102,19 @@ def test_members_assess_themselves(runs: Path) -> None:
     """Without selection each keeps its own; a copy takes the parent's with it."""
     apart = assessed(runs, ([5, 5], [7, 7]), members=2, rule="none", steps=40, name="apart", **IDLE)
     run_to_end(apart)
-    assert [policy.about["worst_return"] for policy in map(apart.ensemble.policy, (0, 1))] == [5, 7]
+    assert [policy.about["worst_return"] for policy in map(apart.loop.policy, (0, 1))] == [5, 7]
     copied = assessed(
         runs, ([5, 5], [7, 7]), algorithm="multi-td3", steps=40, name="copied", **IDLE
     )
     run_to_end(copied)
     for member in (0, 1):
-        assert copied.ensemble.policy(member).about["worst_return"] == 7
-        assert copied.progress.members[member].assessment.best == 7
+        assert copied.loop.policy(member).about["worst_return"] == 7
+        assert copied.loop.policy_checkpoints.assessments[member].best == 7
 
 
 def test_many_updates_are_spread_over_ticks(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The env waits until all are made, and the run ends where one that makes them at once does."""
-    monkeypatch.setattr("pacesetter.ensemble.members.LONGEST", 3)
+    monkeypatch.setattr("pacesetter.ensemble.members.MAX_CALLS_PER_TICK", 3)
     spread = assessed(runs, ([5, 4, 3],), steps=61, name="spread", eval_every=1000)
     run_to_end(spread)
     assert spread.progress.updates == 60
@@ -125,4 +125,4 @@ def test_many_updates_are_spread_over_ticks(runs: Path, monkeypatch: pytest.Monk
     monkeypatch.undo()
     again = assessed(runs, ([5, 4, 3],), steps=61, name="again", eval_every=1000)
     run_to_end(again)
-    assert same(*(jax.device_get(t.ensemble.states[0]) for t in (spread, again)))
+    assert same(*(jax.device_get(t.loop.learners.states[0]) for t in (spread, again)))

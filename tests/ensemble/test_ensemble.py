@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,12 +21,15 @@ from scripted_runs import ENV, IDLE, script, start
 from short_runs import assert_same, content, log, run_to_end
 
 from pacesetter import envs
-from pacesetter.algorithms.contract import NO_MASK, Update
-from pacesetter.ensemble.selection import REMEMBERED, measure
+from pacesetter.algorithms.contract import Learner, Update
+from pacesetter.batch import Layout
+from pacesetter.ensemble.copying import copy_from_parents
+from pacesetter.ensemble.rules import RULES, Choice, choose
+from pacesetter.ensemble.selection import POOLED_SELECTIONS, Selection, measure
 from pacesetter.envs import Environment
-from pacesetter.learner.compiled import KEYS, Draw, Population, inherit
+from pacesetter.errors import UsageError
+from pacesetter.learner.compiled import KEYS, CompiledLearner, KeyUse
 from pacesetter.policy import normalize
-from pacesetter.replay.buffer import Columns
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.training.trainer import Report, Trainer
 
@@ -63,7 +67,7 @@ def test_one_member_is_plain_td3(more: dict[str, Any], runs: Path) -> None:
     settings: dict[str, Any] = {"warmup": 25, "steps": 75}
     multi = start(runs, members=1, name="multi", **settings, **more)
     plain = start(runs, algorithm="td3", name="plain", **settings)
-    plain.progress.next_selection = multi.progress.next_selection  # of trials, which none has
+    plain.loop.selector.next_trials = multi.loop.selector.next_trials  # of trials, which none has
     assert_same(run_to_end(multi), run_to_end(plain))
     assert plain.progress.updates == 50
 
@@ -77,7 +81,7 @@ def test_members_that_do_not_meet_learn_as_if_alone(runs: Path) -> None:
     run_to_end(alone)
     run_to_end(apart)
     assert apart.progress.members[0].steps == alone.progress.members[0].steps == 60
-    one, other = (jax.device_get(trainer.ensemble.states[0]) for trainer in (apart, alone))
+    one, other = (jax.device_get(trainer.loop.learners.states[0]) for trainer in (apart, alone))
     assert same(one, other)
 
 
@@ -88,19 +92,19 @@ def test_selection_copies_the_winner_whole(runs: Path) -> None:
     """After returns 3 and 5 both hold what member 1 held: networks, moments and counter."""
     trainer = start(runs)
     before: list[Any] = []
-    descend = trainer.ensemble.descend
+    apply = trainer.loop.apply
 
-    def watched(parents: Any) -> None:
-        before.extend(jax.device_get(trainer.ensemble.states))
-        descend(parents)
+    def watched(selection: Selection) -> None:
+        before.extend(jax.device_get(trainer.loop.learners.states))
+        apply(selection)
 
-    trainer.ensemble.descend = watched
+    trainer.loop.apply = watched
     with until(trainer, "select") as report:
         assert report.step == 20
         assert report.values["returns"] == [[3], [5]]
         assert report.values["parents"] == [1, 1]
         assert report.values["champion"] == trainer.progress.champion == 1
-        winner, after = before[1], jax.device_get(trainer.ensemble.states)
+        winner, after = before[1], jax.device_get(trainer.loop.learners.states)
     moments = [x for x in jax.tree.leaves(winner.critic_opt_state) if x.ndim]
     assert all(np.any(x) for x in moments)
     assert winner.updates == 10
@@ -113,18 +117,17 @@ def test_selection_copies_the_winner_whole(runs: Path) -> None:
 def test_copies_share_no_buffer_and_no_noise(runs: Path, rng: np.random.Generator) -> None:
     """An update of one leaves the other, and for one observation the two act differently."""
     trainer = start(runs)
-    ensemble, statistics = trainer.ensemble, trainer.ensemble.statistics
+    loop, statistics = trainer.loop, trainer.loop.normalizer.statistics()
     observation, actions = np.ones(3, np.float32), []
     with until(trainer, "select"):
-        states = jax.device_get(ensemble.states)
-        for acting, rng_k in zip(ensemble.acting, ensemble.act_streams, strict=True):
-            assert same(acting, states[1].actor)
-            action, _ = ensemble.algorithm.act(acting, (), observation, copy.deepcopy(rng_k))
-            actions.append(action)
-        rows = ensemble.replays[0].sample(rng, (2, 16)).rows
-        moved = ensemble.population.update(ensemble.states[0], 0, 99, rows, None, statistics)
-        ensemble.states[0] = moved.state
-        after = jax.device_get(ensemble.states)
+        states = jax.device_get(loop.learners.states)
+        for params, explorer in zip(loop.learners.policy_params, loop.explorers, strict=True):
+            assert same(params[0], states[1].actor)
+            rng_k = copy.deepcopy(explorer.act_stream)
+            actions.append(explorer.learner.act(params, (), observation, rng_k)[0])
+        rows = loop.replays[0].sample(rng, (2, 16)).rows
+        loop.learners.update([0], [(99, rows, None, statistics)])
+        after = jax.device_get(loop.learners.states)
     assert not np.any(actions[0] == actions[1])
     assert same(states[0], states[1])
     assert same(after[1], states[1])
@@ -174,13 +177,15 @@ PARENTS = np.array([1, 1, 0])
 
 
 def test_full_copy_takes_everything(states: Any) -> None:
-    for new, parent in zip(inherit(states, PARENTS, "full"), PARENTS, strict=True):
+    for new, parent in zip(
+        copy_from_parents(learner(), states, PARENTS, "full"), PARENTS, strict=True
+    ):
         assert same(new, states[parent])
 
 
 def test_copy_of_weights_leaves_everyone_their_optimiser(states: Any) -> None:
     """Networks and targets are the parent's, moments and counter one's own."""
-    for k, new in enumerate(inherit(states, PARENTS, "weights")):
+    for k, new in enumerate(copy_from_parents(learner(), states, PARENTS, "weights")):
         for part in states[k]._fields:
             source = PARENTS[k] if part in NETWORKS else k
             assert same(getattr(new, part), getattr(states[source], part)), part
@@ -188,7 +193,7 @@ def test_copy_of_weights_leaves_everyone_their_optimiser(states: Any) -> None:
 
 def test_copy_of_the_actor_starts_its_optimiser_anew(states: Any) -> None:
     """The parent's actor, as the target too, without moments; the critics are one's own."""
-    new = inherit(states, PARENTS, "actor")
+    new = copy_from_parents(learner(), states, PARENTS, "actor")
     for k, parent in [(0, 1), (2, 0)]:
         assert same(new[k].actor, states[parent].actor)
         assert same(new[k].target_actor, states[parent].actor)
@@ -201,14 +206,114 @@ def test_copy_of_the_actor_starts_its_optimiser_anew(states: Any) -> None:
 @pytest.mark.parametrize("copy", ["full", "weights", "actor"])
 def test_copying_does_not_depend_on_names(copy: str, states: Any) -> None:
     """Renaming members before or after the copy gives the same states; nobody shares a buffer."""
-    copied = inherit(states, PARENTS, copy)
+    copied = copy_from_parents(learner(), states, PARENTS, copy)
     for names in permutations(range(3)):
         order = np.array(names)
         renamed = np.argsort(order)[PARENTS[order]]
-        one = inherit([states[k] for k in order], renamed, copy)
+        one = copy_from_parents(learner(), [states[k] for k in order], renamed, copy)
         assert same(one, [copied[k] for k in order])
     buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves(copied)]
     assert len(set(buffers)) == len(buffers)
+
+
+def test_average_is_the_mean_of_the_better_half(states: Any) -> None:
+    """Whole numbers, whose means are exact: floating-point leaves of members 2 and 0, counters of
+    the best, for everyone; `weights` and `actor` take their part of it and leave the rest.
+    """
+    states = [jax.tree.map(lambda x: x.round() if x.dtype.kind == "f" else x, s) for s in states]
+    parents, weights, _ = choose("average", np.array([4.0, 1.0, 6.0]), np.random.default_rng())
+    assert parents.tolist() == [2, 2, 2]
+    expected = jax.tree.map(
+        lambda one, best: (one + best) / 2 if best.dtype.kind == "f" else best, states[0], states[2]
+    )
+    for new in copy_from_parents(learner(), states, parents, "full", weights):
+        assert same(new, expected)
+    for own, new in zip(
+        states, copy_from_parents(learner(), states, parents, "weights", weights), strict=True
+    ):
+        assert same(new.actor, expected.actor)
+        assert same(new.critic_opt_state, own.critic_opt_state)
+        assert same(new.updates, own.updates)
+    for own, new in zip(
+        states, copy_from_parents(learner(), states, parents, "actor", weights), strict=True
+    ):
+        assert same(new.target_actor, expected.actor)
+        assert same(new.critic, own.critic)
+
+
+def test_average_in_a_run(runs: Path) -> None:
+    """Returns 3, 5 and 4: all members go on as the mean of members 1 and 2, the champion's place
+    is the best one's, and no episode that another network began counts.
+    """
+    trainer = start(runs, members=3, rule="average", steps=120)
+    apply, before = trainer.loop.apply, list[Any]()
+
+    def watched(selection: Selection) -> None:
+        before.extend(jax.device_get(trainer.loop.learners.states))
+        apply(selection)
+
+    trainer.loop.apply = watched
+    with until(trainer, "select") as report:
+        after = jax.device_get(trainer.loop.learners.states)
+        assert (report.values["parents"], report.values["champion"]) == ([1, 1, 1], 1)
+        assert report.values["weights"] == [[0, 0.5, 0.5]] * 3
+        assert [member.copied for member in trainer.progress.members] == [30] * 3
+    mean = jax.tree.map(lambda x, y: x * np.float32(0.5) + y * np.float32(0.5), *before[1:])
+    for state in after:
+        for part in NETWORKS:
+            assert same(getattr(state, part), getattr(mean, part))
+
+
+# What a rule may change besides.
+
+
+def explore(returns: Any, rng: np.random.Generator) -> Choice:
+    """As PBT: the best one's state, and member 1 with half its critics' learning rate."""
+    factors = np.where(np.arange(len(returns)) == 1, 0.5, 1.0)
+    return Choice(np.full(len(returns), np.argmax(returns)), scales={RATE: factors})
+
+
+RATE = "critic_learning_rate"
+
+
+def test_a_rule_scales_learning_rates(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After two selections member 1 learns as a learner with a quarter of the rate, member 0 as
+    before; factors are logged, and survive a stop.
+    """
+    monkeypatch.setitem(RULES, "best", explore)
+    trainer = start(runs, returns=([3], [5]), steps=40, name="scaled")
+    run_to_end(trainer)
+    rows = [row for row in log(trainer.directory) if row["kind"] == "select"]
+    assert [row["scales"] for row in rows] == [{RATE: [1, 0.5]}] * 2
+    trainer = Trainer.resume(trainer.directory.path, steps=41)
+    loop = trainer.loop
+    scales = [member.scales for member in loop.progress.members]
+    assert scales == [{RATE: 0.5}, {RATE: 0.25}]  # the winner, member 1, had half of it already
+    rows, still = loop.replays[0].padded(32).reshape(2, 16, -1), loop.normalizer.statistics()
+    hyper = loop.config.hyper
+    for k, scale in enumerate((0.5, 0.25)):
+        before = jax.tree.map(jnp.copy, loop.learners.states[k])
+        (found,) = loop.learners.update([k], [(7, rows, None, still, None, scales[k])])
+        plain = learner(spec=loop.explorers[0].learner.spec)
+        plain = replace(
+            plain, hyper=replace(hyper, critic_learning_rate=hyper.critic_learning_rate * scale)
+        )
+        layout = loop.learners.compiled.layout
+        expected = CompiledLearner(plain, layout, 0, False).update(before, k, 7, rows, None, still)
+        for one, other in zip(
+            jax.tree.leaves(found.state), jax.tree.leaves(expected.state), strict=True
+        ):
+            np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
+    trainer.close()
+
+
+def test_a_rule_may_only_scale_learning_rates(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def rule(returns: Any, rng: np.random.Generator) -> Choice:
+        return Choice(np.arange(len(returns)), scales={"gamma": np.ones(len(returns))})
+
+    monkeypatch.setitem(RULES, "best", rule)
+    with pytest.raises(UsageError, match=r"cannot scale 'gamma'.*actor_learning_rate"):
+        run_to_end(start(runs))
 
 
 # Counting.
@@ -264,8 +369,8 @@ def test_selection_on_trials_chooses_by_their_mean(runs: Path) -> None:
     trainer = start(
         runs, returns=([9], [0]), steps=130, select_on="eval", select_every=50, select_window=2
     )
-    trainer.ensemble.trial_env = Environment(ENV, {}, 0, Stream.SELECT)
-    script(trainer.ensemble.trial_env, returns=[1, 3, 5, 9])
+    trainer.loop.selector.trial_env = Environment(ENV, {}, 0, Stream.SELECT)
+    script(trainer.loop.selector.trial_env, returns=[1, 3, 5, 9])
     (row,) = select_rows(trainer)
     assert (row["step"], row["returns"]) == (90, [[1, 3], [5, 9]])
     assert (row["parents"], row["champion"]) == ([1, 1], 1)
@@ -274,27 +379,27 @@ def test_selection_on_trials_chooses_by_their_mean(runs: Path) -> None:
 def test_waiting_members_neither_step_nor_learn(runs: Path) -> None:
     """Rounds of 10 and 30 steps: the first member's arrays rest while the second goes on."""
     trainer = start(runs, lengths=(10, 30), rule="none", steps=125)
-    learn, rests = trainer.ensemble.learn, 0
+    learn, rests = trainer.loop.learn, 0
     steps = [0, 0]
 
     def watched() -> None:
         nonlocal rests, steps
-        before = jax.device_get(trainer.ensemble.states)
+        before = jax.device_get(trainer.loop.learners.states)
         learn()
-        after = jax.device_get(trainer.ensemble.states)
+        after = jax.device_get(trainer.loop.learners.states)
         old, steps = steps, [each.steps for each in trainer.progress.members]
         for k in (0, 1):
             if steps[k] == old[k]:
                 assert same(before[k], after[k])
                 rests += 1
 
-    trainer.ensemble.learn = watched
+    trainer.loop.learn = watched
     run_to_end(trainer)
     assert steps == [33, 92]
     assert rests >= 60
-    owed = [each.owed for each in trainer.progress.members]
-    updates = [int(state.updates) for state in trainer.ensemble.states]
-    np.testing.assert_array_equal(np.add(updates, owed), steps)
+    due = [each.updates_due for each in trainer.progress.members]
+    updates = [int(state.updates) for state in trainer.loop.learners.states]
+    np.testing.assert_array_equal(np.add(updates, due), steps)
 
 
 def test_counting_each_member(runs: Path) -> None:
@@ -350,9 +455,9 @@ def test_error_of_single_episodes_pools_the_last_selections() -> None:
 def test_error_forgets_after_twenty_selections() -> None:
     variances: list[float] = []
     measure(np.array([[0.0], [1000.0]]), variances, False)
-    for _ in range(REMEMBERED):
+    for _ in range(POOLED_SELECTIONS):
         last = measure(np.array([[3.0], [5.0]]), variances, False)
-    assert REMEMBERED == len(variances) == 20
+    assert POOLED_SELECTIONS == len(variances) == 20
     assert last == (2, 2)
 
 
@@ -390,7 +495,7 @@ def test_rule_none_copies_nobody_and_evaluates_all(runs: Path) -> None:
     assert [len(row.get("members", [])) for row in evaluations] == [0, 0, 0, 2]
     assert {row["champion"] for row in rows if "champion" in row} == {0}
     assert all(row["parents"] == [0, 1] for row in rows if row["kind"] == "select")
-    states = jax.device_get(trainer.ensemble.states)
+    states = jax.device_get(trainer.loop.learners.states)
     for part in NETWORKS:
         assert all_differ(*(getattr(state, part) for state in states))
 
@@ -402,7 +507,7 @@ def test_members_begin_apart(runs: Path) -> None:
     """No array of a member's networks is another's, before anybody has learned."""
     trainer = start(runs, **IDLE)
     with until(trainer, "eval"):
-        states = jax.device_get(trainer.ensemble.states)
+        states = jax.device_get(trainer.loop.learners.states)
     for part in NETWORKS:
         assert all_differ(*(getattr(state, part) for state in states))
 
@@ -410,22 +515,22 @@ def test_members_begin_apart(runs: Path) -> None:
 def test_clones_do_not_stay_clones(runs: Path) -> None:
     """Members that begin alike, without target noise, part by their own minibatches alone."""
     trainer = start(runs, same_init=True, rule="none", target_noise=0.0, steps=20)
-    update, batches = trainer.ensemble.population.update, []
+    update, batches = trainer.loop.learners.compiled.update, []
 
     def watched(state: Any, member: int, tick: int, rows: Any, *rest: Any) -> Any:
         batches.append(rows)
         return update(state, member, tick, rows, *rest)
 
-    trainer.ensemble.population.update = watched
+    trainer.loop.learners.compiled.update = watched
     with until(trainer, "eval"):
-        states = jax.device_get(trainer.ensemble.states)
+        states = jax.device_get(trainer.loop.learners.states)
         assert same(*states)
     trainer = Trainer.resume(trainer.directory.path)
-    trainer.ensemble.population.update = watched
+    trainer.loop.learners.compiled.update = watched
     run_to_end(trainer)
     assert len(batches) == 10
     assert not any(np.array_equal(*pair) for pair in zip(batches[::2], batches[1::2], strict=True))
-    states = jax.device_get(trainer.ensemble.states)
+    states = jax.device_get(trainer.loop.learners.states)
     for part in NETWORKS:
         assert all_differ(*(getattr(state, part) for state in states))
 
@@ -435,11 +540,11 @@ def test_members_at_the_same_time_learn_as_one_after_the_other(runs: Path) -> No
     states: list[Any] = []
     for name in ("together", "in-turn"):
         trainer = start(runs, name=name, members=3, rule="none", steps=90, replay="prioritized")
-        ensemble = trainer.ensemble
+        loop = trainer.loop
         if name == "in-turn":
-            ensemble.workers = SimpleNamespace(map=map, shutdown=lambda: None)
+            loop.learners.workers = SimpleNamespace(map=map, shutdown=lambda: None)
         run_to_end(trainer)
-        states.append(jax.device_get(ensemble.states))
+        states.append(jax.device_get(loop.learners.states))
     assert same(*states)
 
 
@@ -449,10 +554,10 @@ def test_clones_on_one_minibatch_part_by_their_keys(
 ) -> None:
     """The same rows for both: equal without target noise, apart with it."""
     trainer = start(runs, same_init=True, target_noise=noise)
-    ensemble = trainer.ensemble
-    rows = rng.normal(size=(2, 16, ensemble.columns.width)).astype(np.float32)
-    update, statistics = ensemble.population.update, ensemble.statistics
-    moved = [update(ensemble.states[k], k, 0, rows, None, statistics).state for k in (0, 1)]
+    loop = trainer.loop
+    rows = rng.normal(size=(2, 16, loop.learners.compiled.layout.width)).astype(np.float32)
+    update, statistics = loop.learners.compiled.update, loop.normalizer.statistics()
+    moved = [update(loop.learners.states[k], k, 0, rows, None, statistics).state for k in (0, 1)]
     moved = jax.device_get(moved)
     trainer.close()
     assert same(*moved) == (noise == 0)
@@ -462,35 +567,18 @@ class Told(NamedTuple):
     key: Any
 
 
-class KeyTeller:
-    """An algorithm that learns nothing and tells the key and the observations it is given."""
-
-    cycle = 1
-
-    def mask(self, rng: np.random.Generator) -> Any:
-        return NO_MASK
+class KeyTeller(Learner):
+    """A learner that learns nothing and tells the key and the observations it is given."""
 
     def init(self, key: Any) -> Told:
         return Told(jax.random.key_data(key))
 
-    def acting(self, state: Told) -> Any:
+    def policy_params(self, state: Told) -> Any:
         return state.key
-
-    def begin(self, acting: Any, rng: np.random.Generator) -> Any:
-        return ()
-
-    def act(self, acting: Any, memory: Any, observation: Any, rng: np.random.Generator) -> Any:
-        raise NotImplementedError
 
     def update(self, state: Told, batch: Any, key: Any) -> Update:
         seen = jnp.concatenate([batch.observation, batch.next_observation], axis=-1)
         return Update(Told(jax.random.key_data(key)), {"loss": jnp.zeros(())}, seen)
-
-    def ledger(self, states: Any, updates: int, actions: int) -> dict[str, int]:
-        return {}
-
-    def policy(self, state: Told) -> Any:
-        raise NotImplementedError
 
 
 STILL = np.zeros(3, np.float32), np.ones(3, np.float32)
@@ -500,16 +588,16 @@ def test_no_two_draws_of_a_run_share_a_key() -> None:
     """Every member's init and every cycle of it, also where the next block of keys is made; each
     is the run's key with its purpose, its cycle and its member folded in.
     """
-    columns = Columns(*SPEC)
-    population = Population(KeyTeller(), columns, seed=0, normalize=False)
-    rows = np.zeros((1, 1, columns.width), np.float32)
-    states = population.init(3, same=False)
+    layout = Layout(SPEC)
+    compiled = CompiledLearner(KeyTeller(), layout, seed=0, normalize=False)
+    rows = np.zeros((1, 1, layout.width), np.float32)
+    states = compiled.init(3, same=False)
     told = [tuple(np.asarray(state.key)) for state in states]
     cycles = [0, 1, 2, KEYS - 1, KEYS, KEYS + 1, 5 * KEYS + 3]
     for cycle in cycles:
         for k, state in enumerate(states):
-            states[k] = population.update(state, k, cycle, rows, None, STILL).state
-            folded = jax.random.fold_in(jax.random.key(0), Draw.UPDATE)
+            states[k] = compiled.update(state, k, cycle, rows, None, STILL).state
+            folded = jax.random.fold_in(jax.random.key(0), KeyUse.UPDATE)
             folded = jax.random.fold_in(jax.random.fold_in(folded, cycle), k)
             assert np.array_equal(states[k].key, jax.random.key_data(folded))
         told += [tuple(np.asarray(state.key)) for state in states]
@@ -517,24 +605,24 @@ def test_no_two_draws_of_a_run_share_a_key() -> None:
 
 
 def test_keys_stay_of_their_kind_whatever_the_default_is_later() -> None:
-    columns = Columns(*SPEC)
+    layout = Layout(SPEC)
     with jax.default_prng_impl("rbg"):
-        population = Population(KeyTeller(), columns, seed=0, normalize=False)
-        state = population.init(1, same=False)[0]
-    rows = np.zeros((1, 1, columns.width), np.float32)
-    key = population.update(state, 0, 0, rows, None, STILL).state.key
+        compiled = CompiledLearner(KeyTeller(), layout, seed=0, normalize=False)
+        state = compiled.init(1, same=False)[0]
+    rows = np.zeros((1, 1, layout.width), np.float32)
+    key = compiled.update(state, 0, 0, rows, None, STILL).state.key
     assert key.shape == state.key.shape == (4,)
 
 
 def test_members_learn_from_observations_as_they_act_on_them(rng: np.random.Generator) -> None:
     """Raw rows are scaled for the learner as an observation is for acting, cut at +-10."""
-    columns = Columns(*SPEC)
-    population = Population(KeyTeller(), columns, seed=0, normalize=True)
-    rows = rng.normal(size=(1, 3, columns.width), scale=20).astype(np.float32)
+    layout = Layout(SPEC)
+    compiled = CompiledLearner(KeyTeller(), layout, seed=0, normalize=True)
+    rows = rng.normal(size=(1, 3, layout.width), scale=20).astype(np.float32)
     statistics = np.array([3, -2, 0], np.float32), np.array([2, 0.5, 7], np.float32)
-    (state,) = population.init(1, same=True)
-    seen = np.asarray(population.update(state, 0, 0, rows, None, statistics).error[0])
-    batch = columns.unpack(rows[0], None)
+    (state,) = compiled.init(1, same=True)
+    seen = np.asarray(compiled.update(state, 0, 0, rows, None, statistics).td_error[0])
+    batch = layout.unpack(rows[0])
     raw = np.stack([batch.observation, batch.next_observation], axis=1)
     assert np.abs(seen).max() == 10
     np.testing.assert_allclose(seen.reshape(3, 2, 3), normalize(raw, *statistics), rtol=1e-6)
@@ -545,7 +633,7 @@ def test_replay_scope_says_whose_rows_a_replay_holds(scope: str, runs: Path) -> 
     """One replay with everybody's rows in turn, or each member's own rows only."""
     trainer = start(runs, replay_scope=scope, **IDLE)
     with until(trainer, "select"):
-        marks = [replay.rows[: replay.head, 0].tolist() for replay in trainer.ensemble.replays]
+        marks = [replay.rows[: replay.head, 0].tolist() for replay in trainer.loop.replays]
     assert marks == ([[0, 1] * 10] if scope == "shared" else [[0] * 10, [1] * 10])
 
 
@@ -553,7 +641,7 @@ def test_members_learn_from_the_rows_of_their_scope(runs: Path) -> None:
     """With replays of their own, a member's minibatches hold its rows alone."""
     for scope, expected in (("member", {(0, 0), (1, 1)}), ("shared", None)):
         trainer = start(runs, replay_scope=scope, name=scope, rule="none", steps=60)
-        update, seen = trainer.ensemble.population.update, set()
+        update, seen = trainer.loop.learners.compiled.update, set()
 
         def watched(
             state: Any, k: int, tick: int, rows: Any, *rest: Any, to: Any = update, into: Any = seen
@@ -561,7 +649,7 @@ def test_members_learn_from_the_rows_of_their_scope(runs: Path) -> None:
             into |= {(k, mark) for mark in rows[..., 0].ravel()}
             return to(state, k, tick, rows, *rest)
 
-        trainer.ensemble.population.update = watched
+        trainer.loop.learners.compiled.update = watched
         run_to_end(trainer)
         assert seen == (expected or {(0, 0), (0, 1), (1, 0), (1, 1)})
 
@@ -577,7 +665,7 @@ def test_evaluations_do_not_disturb_training(runs: Path) -> None:
     one, other = (content(run_to_end(trainer)) for trainer in (often, rarely))
     assert sum(row["kind"] == "eval" for row in one["log"]) > 10
     assert same(one["arrays"], other["arrays"])
-    for part in ("streams", "replays", "episodes"):
+    for part in ("states", "replay.0", "env.0", "env.1"):
         assert one["table"][part] == other["table"][part]
 
 

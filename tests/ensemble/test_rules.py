@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pacesetter.ensemble.rules import RULES
+from pacesetter.ensemble.rules import RULES, choose
 
 RETURNS = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9).map(np.array)
 TIED = st.lists(st.integers(0, 2).map(float), min_size=1, max_size=9).map(np.array)
@@ -18,7 +18,7 @@ SEEDS = st.integers(0, 2**32)
 
 
 def parents_of(rule: str, returns: Any, seed: int = 0) -> list[int]:
-    return RULES[rule](returns, np.random.default_rng(seed)).tolist()
+    return choose(rule, returns, np.random.default_rng(seed)).parents.tolist()
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -26,7 +26,7 @@ def parents_of(rule: str, returns: Any, seed: int = 0) -> list[int]:
 def test_parents_are_members_and_returns_stay(rule: str, returns: Any, seed: int) -> None:
     """One parent a member, each a member, and the returns are not written to."""
     before = returns.copy()
-    parents = RULES[rule](returns, np.random.default_rng(seed))
+    parents = choose(rule, returns, np.random.default_rng(seed)).parents
     assert parents.shape == returns.shape
     assert np.issubdtype(parents.dtype, np.integer)
     assert parents.min() >= 0
@@ -113,3 +113,19 @@ def test_renaming_members_renames_parents(rule: str, returns: Any, order: st.Dat
 @given(returns=DISTINCT, shift=st.integers(-1000, 1000), scale=st.sampled_from([0.5, 1, 64]))
 def test_only_the_order_of_returns_counts(rule: str, returns: Any, shift: int, scale: Any) -> None:
     assert parents_of(rule, returns, 5) == parents_of(rule, scale * returns + shift, 5)
+
+
+@given(returns=RETURNS | TIED)
+def test_average_weights_the_better_half_alike(returns: Any) -> None:
+    """Everyone's row: 1 / half for the half that `top_half` keeps, else 0; the best is parent."""
+    count, half = len(returns), -(-len(returns) // 2)
+    parents, weights, scales = choose("average", returns, np.random.default_rng(0))
+    assert weights is not None
+    assert scales is None
+    kept = np.flatnonzero(
+        choose("top_half", returns, np.random.default_rng(0)).parents == np.arange(count)
+    )
+    assert parents.tolist() == parents_of("best", returns)
+    for row in weights:
+        assert np.flatnonzero(row).tolist() == kept.tolist()
+        assert set(row[kept]) == {1 / half}

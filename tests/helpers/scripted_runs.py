@@ -20,8 +20,8 @@ def start(
 ) -> Trainer:
     """A run whose member k plays episodes of given length and returns, marked k."""
     trainer = Trainer(algorithm, ENV, runs=runs, **{**TINY, "warmup": 0, "steps": 120, **settings})
-    for k, env in enumerate(trainer.ensemble.envs):
-        script(env, returns=list(returns[k]), length=lengths[k], mark=float(k), episode=-1)
+    for k, explorer in enumerate(trainer.loop.explorers):
+        script(explorer.env, returns=list(returns[k]), length=lengths[k], mark=float(k), episode=-1)
     return trainer
 
 

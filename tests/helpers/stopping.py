@@ -31,7 +31,7 @@ PATIENCE = 120
 
 def stop_at(trainer: Trainer, tick: int) -> None:
     """Run until a tick has passed, then end as a signal would."""
-    once = trainer.ensemble.tick
+    once = trainer.loop.tick
 
     def tick_and_stop() -> object:
         selection = once()
@@ -39,7 +39,7 @@ def stop_at(trainer: Trainer, tick: int) -> None:
             trainer.stop()
         return selection
 
-    trainer.ensemble.tick = tick_and_stop
+    trainer.loop.tick = tick_and_stop
     run_to_end(trainer)
 
 

@@ -129,7 +129,7 @@ def test_a_run_asks_for_it_by_name(tmp_path: Path) -> None:
             steps=120, warmup=100, batch_size=64, hidden=(64, 64), eval_episodes=1,
         )  # fmt: skip
         list(trainer)
-        actors.append(jax.tree.map(np.asarray, trainer.ensemble.states[0].actor))
+        actors.append(jax.tree.map(np.asarray, trainer.loop.learners.states[0].actor))
     apart = jax.tree.map(lambda x, y: np.abs(x - y).max(), *actors)
     assert 0 < max(jax.tree.leaves(apart)) < 0.02  # 20 Adam steps of 3e-4, opposed: 0.012
 

@@ -172,14 +172,15 @@ def test_noisy_actor_lasts_an_episode(runs: Path) -> None:
     """In a run that learns: drawn anew where an episode begins, and nowhere else."""
     settings = {**TINY, **NOISY, "warmup": 20, "steps": 100}
     trainer = Trainer("td3", "probe_envs:Scripted-v0", runs=runs, **settings)
-    ensemble = trainer.ensemble
-    step, seen = ensemble._step, []
+    loop = trainer.loop
+    step, seen = loop._step, []
 
-    def watched(k: int, action: Any) -> None:
-        seen.append((not ensemble.envs[k].actions, copy.deepcopy(ensemble.memory[k])))
-        step(k, action)
+    def watched(k: int) -> None:
+        explorer = loop.explorers[k]
+        seen.append((not explorer.env.actions, copy.deepcopy(explorer.noise_state)))
+        step(k)
 
-    ensemble._step = watched
+    loop._step = watched
     run_to_end(trainer)
     assert [start for start, _ in seen] == [i % 10 == 0 for i in range(100)]
     for (_, before), (start, after) in pairwise(seen):

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from short_runs import TINY, run_to_end
 
-from pacesetter.replay.n_step import Pending, Transition
+from pacesetter.batch import Transition
+from pacesetter.replay.n_step import NStepQueue
 from pacesetter.training.trainer import Trainer
 
 GAMMA = 0.9
@@ -43,7 +43,7 @@ def by_definition(steps: list[Transition], n: int, terminated: bool) -> list[Tra
         rows.append(
             first._replace(
                 reward=sum(GAMMA**i * steps[t + i].reward for i in range(m)),
-                following=steps[end].following,
+                next_observation=steps[end].next_observation,
                 discount=GAMMA**m * (1 - falls),
                 last=end == len(steps) - 1,
             )
@@ -54,13 +54,16 @@ def by_definition(steps: list[Transition], n: int, terminated: bool) -> list[Tra
 def equal(one: Transition, other: Transition) -> None:
     for name, a, b in zip(Transition._fields, one, other, strict=True):
         tolerance = 1e-12 if name in ("reward", "discount") else 0
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+        if a is None or b is None:
+            assert a is b
+        else:
+            np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 7, 20])
 def test_rows_are_the_definition_for_members_in_turn(n: int, rng: np.random.Generator) -> None:
     """Falls and cuts, episodes shorter and longer than n, members interleaved, stopped anywhere."""
-    queues = [Pending(n) for _ in range(3)]
+    queues = [NStepQueue(n) for _ in range(3)]
     found: list[list[Transition]] = [[], [], []]
     expected: list[list[Transition]] = [[], [], []]
     steps: list[list[Transition]] = [[], [], []]
@@ -74,7 +77,7 @@ def test_rows_are_the_definition_for_members_in_turn(n: int, rng: np.random.Gene
         k = int(rng.choice([k for k in range(3) if steps[k]]))
         found[k] += queues[k].push(steps[k].pop(0))
         if rng.random() < 0.3:
-            again = Pending(n)
+            again = NStepQueue(n)
             again.restore(queues[k].arrays())
             queues[k] = again
     for k in range(3):
@@ -86,13 +89,13 @@ def test_rows_are_the_definition_for_members_in_turn(n: int, rng: np.random.Gene
 def test_one_step_passes_untouched(rng: np.random.Generator) -> None:
     """The very object, so that nothing changes for who does not ask for more."""
     (step, *_) = episode(rng, terminated=False)
-    assert Pending(1).push(step)[0] is step
+    assert NStepQueue(1).push(step)[0] is step
 
 
 def test_a_broken_off_episode_keeps_its_rows(rng: np.random.Generator) -> None:
     """They are shorter, bootstrap where they led, and do not say that anything ended."""
     steps = [step._replace(last=False, discount=GAMMA) for step in episode(rng, False) * 2][:2]
-    queue = Pending(5)
+    queue = NStepQueue(5)
     assert queue.push(steps[0]) == queue.push(steps[1]) == []
     rows = queue.flush()
     np.testing.assert_allclose([row.discount for row in rows], [GAMMA**2, GAMMA])
@@ -106,12 +109,12 @@ def test_rows_of_a_run_lead_over_their_steps(runs: Path) -> None:
     trainer = Trainer(
         "multi-td3", "probe_envs:Corridor-v0", runs=runs, env_kwargs={"falls_at": 4}, **settings
     )
-    ensemble = trainer.ensemble
-    replay = ensemble.replays[0]
+    loop = trainer.loop
+    replay = loop.replays[0]
     run_to_end(trainer)
     assert replay.head == 16
-    flat = np.fromfile(replay.path, np.float32).reshape(-1, ensemble.columns.width)
-    rows = jax.device_get(ensemble.columns.unpack(flat[:8], None))
+    flat = np.fromfile(replay.path, np.float32).reshape(-1, loop.learners.compiled.layout.width)
+    rows = loop.learners.compiled.layout.unpack(flat[:8])
     np.testing.assert_array_equal(rows.observation[:, 0], [0, 0, 1, 2, 3, 1, 2, 3])
     np.testing.assert_array_equal(rows.next_observation[:, 0], [3, 3, 4, 4, 4, 4, 4, 4])
     np.testing.assert_array_equal(rows.reward, [1.75, 1.75, 1.75, 1.5, 1, 1.75, 1.5, 1])

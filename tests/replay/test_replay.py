@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from pacesetter.batch import Layout, Spec, Transition
 from pacesetter.errors import UsageError
 from pacesetter.replay import buffer as module
-from pacesetter.replay.buffer import Columns, Replay
+from pacesetter.replay.buffer import Replay
 
-COLUMNS = Columns(observation=2, action=1, masks=2)
+LAYOUT = Layout(Spec(observation_size=2, action_size=1), masks=2)
 CAPACITY = 50
-SHIPPED = (module.SLACK, module.UNCOMMITTED, module.MEMBERS, module.BLOCK)
+SHIPPED = (module.SLACK, module.UNCOMMITTED, module.MAX_ROWS_PER_TICK, module.BLOCK)
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +25,7 @@ def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of 8 rows, and 20 + 3 between checkpoints, so that few rows go all the way round."""
     monkeypatch.setattr(module, "BLOCK", 8)
     monkeypatch.setattr(module, "UNCOMMITTED", 20)
-    monkeypatch.setattr(module, "MEMBERS", 3)
+    monkeypatch.setattr(module, "MAX_ROWS_PER_TICK", 3)
     monkeypatch.setattr(module, "SLACK", 2 * (20 + 3) + 8)
 
 
@@ -34,7 +35,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def ring(file: Path, capacity: int = CAPACITY, budget: int = 10_000) -> Replay:
-    return Replay(file, COLUMNS, capacity, budget)
+    return Replay(file, LAYOUT, capacity, budget)
 
 
 def row(number: int) -> list[float]:
@@ -45,15 +46,17 @@ def row(number: int) -> list[float]:
 
 def fill(replay: Replay, count: int) -> None:
     for number in range(replay.head, replay.head + count):
-        o, p, action, reward, following, after, discount, last, *mask = row(number)
+        o, p, action, reward, q, r, discount, last, *mask = row(number)
         replay.add(
-            np.array([o, p], np.float32),
-            np.array([action], np.float32),
-            reward,
-            np.array([following, after], np.float32),
-            discount,
-            bool(last),
-            np.array(mask, np.float32),
+            Transition(
+                observation=np.array([o, p], np.float32),
+                action=np.array([action], np.float32),
+                reward=reward,
+                next_observation=np.array([q, r], np.float32),
+                discount=discount,
+                last=bool(last),
+                mask=np.array(mask, np.float32),
+            )
         )
 
 
@@ -84,7 +87,7 @@ def test_parts_of_a_row_come_back_apart(file: Path) -> None:
     """What `add` was given is what a batch holds, each part under its name."""
     replay = ring(file)
     fill(replay, 4)
-    batch = COLUMNS.unpack(window(replay), None)
+    batch = LAYOUT.unpack(window(replay))
     numbers = np.arange(4.0)
     np.testing.assert_array_equal(batch.observation, np.stack([numbers, numbers + 0.25], 1))
     np.testing.assert_array_equal(batch.action, -numbers[:, None])
@@ -94,7 +97,7 @@ def test_parts_of_a_row_come_back_apart(file: Path) -> None:
     )
     np.testing.assert_array_equal(batch.discount, np.full(4, 0.5))
     np.testing.assert_array_equal(batch.last, numbers % 2)
-    np.testing.assert_array_equal(batch.weight, np.ones(4))
+    assert batch.weight is None
     np.testing.assert_array_equal(batch.mask, np.stack([numbers % 3, numbers % 5], 1))
 
 
@@ -107,7 +110,7 @@ def test_sampling_is_uniform_over_the_window(
     fill(replay, rows)
     size = min(rows, CAPACITY)
     sample = replay.sample(rng, (2, 25_000))
-    assert sample.rows.shape == (2, 25_000, COLUMNS.width)
+    assert sample.rows.shape == (2, 25_000, LAYOUT.width)
     np.testing.assert_array_equal(sample.rows, replay.rows[sample.numbers % replay.slots])
     counts = np.bincount(sample.rows[..., 0].astype(int).ravel(), minlength=rows)
     assert counts[: rows - size].sum() == 0
@@ -196,7 +199,7 @@ def flip(file: Path, number: int) -> None:
     """Change one bit of the first byte of row `number` in the file."""
     slot = number % (CAPACITY + module.SLACK)
     data = bytearray(file.read_bytes())
-    data[slot * COLUMNS.width * 4] ^= 1
+    data[slot * LAYOUT.width * 4] ^= 1
     file.write_bytes(data)
 
 
@@ -230,7 +233,7 @@ def test_a_bit_outside_the_window_is_nobodys_loss(file: Path, number: int) -> No
 
 def test_file_is_no_longer_than_the_budget_and_grows_with_it(file: Path) -> None:
     """A short run reserves only its own rows; a larger budget adds room and keeps the rows."""
-    size = COLUMNS.width * 4
+    size = LAYOUT.width * 4
     short = ring(file, budget=30)
     assert file.stat().st_size == 30 * size
     fill(short, 30)

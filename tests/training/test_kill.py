@@ -220,7 +220,7 @@ def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:
 
 def poison(trainer: Trainer, field: str, member: int, value: float) -> None:
     """Put a number into the first array of a part of one member's state."""
-    states = trainer.ensemble.states
+    states = trainer.loop.learners.states
     leaves, structure = jax.tree.flatten(getattr(states[member], field))
     place = next(i for i, leaf in enumerate(leaves) if leaf.dtype == np.float32)
     leaves[place] = leaves[place].at[(0,) * leaves[place].ndim].set(value)
@@ -230,7 +230,7 @@ def poison(trainer: Trainer, field: str, member: int, value: float) -> None:
 
 def at_step(trainer: Trainer, step: int, do: Callable[[], object]) -> None:
     """Do something when the run has made so many steps."""
-    tick = trainer.ensemble.tick
+    tick = trainer.loop.tick
 
     def tick_and_do() -> Any:
         selection = tick()
@@ -238,7 +238,7 @@ def at_step(trainer: Trainer, step: int, do: Callable[[], object]) -> None:
             do()
         return selection
 
-    trainer.ensemble.tick = tick_and_do
+    trainer.loop.tick = tick_and_do
 
 
 PARTS = ("actor", "critic", "target_critic", "actor_opt_state", "critic_opt_state")
@@ -265,8 +265,8 @@ def test_fault_in_a_loss(
 ) -> None:
     """The loss is named, with its member; the run goes on from before it, exactly."""
     trainer = late(tmp_path / "faulty")
-    population = trainer.ensemble.population
-    update = population.update
+    compiled = trainer.loop.learners.compiled
+    update = compiled.update
 
     def broken(state: Any, member: int, *rest: Any) -> Any:
         result = update(state, member, *rest)
@@ -275,7 +275,7 @@ def test_fault_in_a_loss(
             losses[0] = np.inf
         return result._replace(losses=losses)
 
-    monkeypatch.setattr(population, "update", broken)
+    monkeypatch.setattr(compiled, "update", broken)
     with pytest.raises(TrainingError, match=r"^member 1, step 600: actor_loss is inf"):
         run_to_end(trainer)
     resumed = run_to_end(Trainer.resume(trainer.directory.path))

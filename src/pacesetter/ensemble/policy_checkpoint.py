@@ -1,4 +1,4 @@
-"""Policies that training episodes assess before they learn on: TD7's checkpoints.
+"""Policies that training episodes assess before they learn on: TD7's policy checkpoints.
 
 While a member is assessed its policy stays fixed and its updates wait. The assessment ends
 as soon as one episode returns less than the worst of the kept policy (it is dropped), or
@@ -6,9 +6,16 @@ after enough episodes (it is kept, and evaluated from now on). Then the updates 
 Reference: sfujim/TD7, maybe_train_and_checkpoint.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
-LOWERED = 0.1  # of the best worst return, once, when assessments become longer
+from pacesetter.ensemble.rules import Parents
+from pacesetter.learner.tree_arrays import below, flatten, rebuild
+from pacesetter.policy import Policy
+from pacesetter.types import Arrays
+
+LONG_AFTER = 750_000  # updates (TD7)
+LOWERED_BY = 0.1  # of the best worst return, once, when assessments become longer
 
 
 @dataclass
@@ -20,18 +27,15 @@ class Assessment:
     long: bool = False  # whether assessments take more than one episode now
     over: bool = False  # whether updates may be made
 
-    def copy(self) -> "Assessment":
-        return replace(self, returns=list(self.returns))
-
     def add(self, episode_return: float, long: bool, most: int) -> bool | None:
-        """Take in an episode: True to keep the policy, False to drop it, None to go on.
+        """Add an episode: True to keep the policy, False to drop it, None to go on.
 
         `long` assessments have `most` episodes, others one. TD7 multiplies the best worst return
         by 0.9 at the change, which would raise a negative one; here it always falls by a tenth.
         """
         if long and not self.long:
             self.long = True
-            self.best = None if self.best is None else self.best - LOWERED * abs(self.best)
+            self.best = None if self.best is None else self.best - LOWERED_BY * abs(self.best)
         self.returns.append(episode_return)
         worst, wanted = min(self.returns), most if self.long else 1
         verdict = None
@@ -42,3 +46,78 @@ class Assessment:
         if verdict is not None:
             self.returns, self.over = [], True
         return verdict
+
+
+class PolicyCheckpoints:
+    """The assessments of all members and the policies that were kept; `--assess 0` has none."""
+
+    def __init__(self, hyper: Any, members: int, like: Policy) -> None:
+        """All policies have the shapes of one like it."""
+        self.episodes: int = hyper.assess
+        self.long_after: int = LONG_AFTER if hyper.assess_after is None else hyper.assess_after
+        self.assessments = [Assessment() for _ in range(members)]
+        self.kept: list[Policy | None] = [None] * members
+        self.like = like
+        self.verdicts: list[list[Any]] = []  # [member, kept] since the last row
+
+    def start_episode(self, k: int) -> None:
+        """Member k's updates wait for the end of its episode."""
+        self.assessments[k].over = False
+
+    def may_update(self, k: int) -> bool:
+        """Whether no assessment of member k holds its updates back."""
+        return not self.episodes or self.assessments[k].over
+
+    def end_episode(self, k: int, total: float, updates: int, policy: Policy, step: int) -> None:
+        """Keep or drop member k's policy, after so many updates, or assess it further."""
+        assessment = self.assessments[k]
+        verdict = assessment.add(total, updates >= self.long_after, self.episodes)
+        if verdict is not None:
+            self.verdicts.append([k, verdict])
+        if verdict:
+            about = {"kept_at": step, "worst_return": assessment.best}
+            self.kept[k] = replace(policy, about=about)
+
+    def policy(self, k: int) -> Policy | None:
+        """The best policy of member k that was kept, if any was."""
+        kept = self.kept[k]
+        return kept and replace(kept, about=dict(kept.about))
+
+    def copy(self, parents: Parents) -> None:
+        """Every member takes over what was found of its parent's policy."""
+        before = self.assessments
+        self.kept = [self.kept[parent] for parent in parents]
+        self.assessments = [
+            replace(before[parent], returns=list(before[parent].returns), over=own.over)
+            for parent, own in zip(parents, before, strict=True)
+        ]
+
+    def training_values(self) -> dict[str, Any]:
+        """Verdicts since the last row, if there are any."""
+        values = {"assessed": self.verdicts} if self.verdicts else {}
+        self.verdicts = []
+        return values
+
+    def arrays(self) -> Arrays:
+        return flatten([policy and _parts(policy) for policy in self.kept])
+
+    def table(self) -> dict[str, Any]:
+        return {
+            "assessments": [asdict(assessment) for assessment in self.assessments],
+            "kept": [policy and policy.about for policy in self.kept],
+            "verdicts": self.verdicts,
+        }
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
+        """The inverse of `arrays` and `table`."""
+        self.assessments = [Assessment(**each) for each in table["assessments"]]
+        self.verdicts = table["verdicts"]
+        for k, about in enumerate(table["kept"]):
+            self.kept[k] = None
+            if about is not None:
+                actors, normalizer = rebuild(_parts(self.like), below(str(k), arrays))
+                self.kept[k] = replace(self.like, actors=actors, normalizer=normalizer, about=about)
+
+
+def _parts(policy: Policy) -> Any:
+    return policy.actors, policy.normalizer

@@ -1,42 +1,147 @@
 """Who sets the pace: selections on training episodes or on extra trials, and how sure each was."""
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from math import inf
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pacesetter.ensemble.rules import RULES, Parents
+from pacesetter.config import Config
+from pacesetter.ensemble.progress import Progress
+from pacesetter.ensemble.rules import Choice, Parents, Returns, choose
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
 from pacesetter.evaluation import rollouts
-from pacesetter.seeding import Stream
+from pacesetter.policy import Policy
+from pacesetter.seeding import Stream, generator
+from pacesetter.types import Arrays
 
-if TYPE_CHECKING:
-    from pacesetter.ensemble.members import Ensemble
-
-Returns = NDArray[np.float64]
-REMEMBERED = 20
+POOLED_SELECTIONS = 20
 
 
 class Selection(NamedTuple):
-    """Who starts again from whom, and on what grounds; returns are (K, episodes)."""
+    """Who starts again from whom, and on what grounds."""
 
-    parents: list[int]
+    choice: Choice
     champion: int
-    returns: list[list[float]]
+    returns: list[list[float]]  # (K, episodes)
     gap: float
     standard_error: float
+
+    def row(self) -> dict[str, Any]:
+        """As plain JSON for the log."""
+        parents, weights, scales = self.choice
+        row = {"parents": parents.tolist(), **self._asdict()}
+        del row["choice"]
+        if weights is not None:
+            row["weights"] = weights.tolist()
+        if scales is not None:
+            row["scales"] = {name: factors.tolist() for name, factors in scales.items()}
+        return row
+
+
+class Selector:
+    """Selects by the rule of the settings; the members apply what it returns."""
+
+    def __init__(self, config: Config, budget: int) -> None:
+        self.config, self.budget = config, budget
+        self.stream = generator(config.run.seed, Stream.RULE)
+        self.returns: list[list[float]] = [[] for _ in range(config.run.members)]
+        self.variances: list[float] = []  # of the last selections
+        self.selections = 0
+        self.next_trials = 0
+        self.trial_env: Environment | None = None
+        self._plan_trials(config.select_after)
+
+    def end_episode(self, k: int, total: float, started: int, copied: int) -> None:
+        """Add a training episode of member k; it counts if it began after the warm-up, at step
+        `started`, and the weights that played it are still the member's own.
+        """
+        run = self.config.run
+        counts = run.members > 1 and run.select_on == "train"
+        if counts and started >= max(self.config.select_after, copied):
+            self.returns[k].append(total)
+
+    def on_training(self, progress: Progress) -> Selection | None:
+        """Select on the training episodes since the last selection, once each member has enough."""
+        window = self.config.run.select_window
+        if min(len(returns) for returns in self.returns) < window:
+            return None
+        returns = np.array([each[-window:] for each in self.returns])
+        self.returns = [[] for _ in self.returns]
+        return self._select(returns, progress.champion, paired=False)
+
+    def trials_are_due(self, step: int) -> bool:
+        """Whether extra episodes must decide now."""
+        run = self.config.run
+        by_trials = run.members > 1 and run.select_on == "eval"
+        return by_trials and self.next_trials <= step < self.budget
+
+    def on_trials(self, policies: Sequence[Policy], progress: Progress) -> Selection | None:
+        """Select on extra noise-free episodes with the same starts for each; the progress counts
+        their steps. A selection that the budget cuts short decides nothing.
+        """
+        returns = [self._trial(k, policy, progress) for k, policy in enumerate(policies)]
+        self._plan_trials(progress.step)
+        if progress.step >= self.budget:
+            return None
+        return self._select(np.array(returns), progress.champion, paired=True)
+
+    def _plan_trials(self, step: int) -> None:
+        every = self.config.run.select_every * self.config.steps_per_count
+        self.next_trials = (step // every + 1) * every
+
+    def _trial(self, k: int, policy: Policy, progress: Progress) -> list[float]:
+        run = self.config.run
+        if self.trial_env is None:
+            self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
+        first, counted = self.selections * run.select_window, run.count_selection_steps
+        limit = self.budget - progress.step if counted else inf
+        with blame(k, progress.step):
+            trial = rollouts(policy.act, self.trial_env, run.select_window, first, limit=limit)
+        progress.selection_steps += sum(trial.lengths)
+        progress.free_steps += 0 if counted else sum(trial.lengths)
+        return trial.returns
+
+    def _select(self, returns: Returns, champion: int, paired: bool) -> Selection:
+        means, rule = returns.mean(axis=1), self.config.run.rule
+        choice = choose(rule, means, self.stream)
+        if rule != "none":
+            champion = find_champion(means, choice.parents)
+        self.selections += 1
+        gap, error = measure(returns, self.variances, paired)
+        return Selection(choice, champion, returns.tolist(), gap, error)
+
+    def table(self) -> dict[str, Any]:
+        return {
+            "stream": self.stream.bit_generator.state,
+            "returns": self.returns,
+            "variances": self.variances,
+            "selections": self.selections,
+            "next_trials": self.next_trials,
+        }
+
+    def arrays(self) -> Arrays:
+        return {}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
+        """The inverse of `table`."""
+        self.stream.bit_generator.state = table["stream"]
+        self.returns, self.variances = table["returns"], table["variances"]
+        self.selections, self.next_trials = table["selections"], table["next_trials"]
+
+    def close(self) -> None:
+        """Let go of the env of trials."""
+        if self.trial_env is not None:
+            self.trial_env.close()
 
 
 def measure(returns: Returns, variances: list[float], paired: bool) -> tuple[float, float]:
     """Best mean return minus the next, and the standard error of such a difference.
 
-    With n > 1 episodes a member, the variance is that of a member's own episodes; `paired` ones had
-    the same starts for each member, and what a start does to all is taken out. With one, it is
-    that between the members: after a copy they are clones, so their spread is noise, and where
+    With n > 1 episodes per member, the variance is that of a member's own episodes; `paired` ones
+    had the same starts for each member, and what a start does to all is subtracted. With one, it
+    is that between the members: after a copy they are clones, so their spread is noise, and where
     they are not, the error is overstated. Either is pooled over the last 20 selections, which
     `variances` remembers.
     """
@@ -49,65 +154,12 @@ def measure(returns: Returns, variances: list[float], paired: bool) -> tuple[flo
         own = own - own.mean(axis=0) if paired else own
         spread = (own**2).sum() / ((members - paired) * (episodes - 1))
     variances.append(float(spread))
-    del variances[:-REMEMBERED]
+    del variances[:-POOLED_SELECTIONS]
     error = float(np.sqrt(2 * np.mean(variances) / episodes))
     return float(means[-1] - means[-2]), error
 
 
-def on_training(ensemble: Ensemble) -> Selection | None:
-    """Select on the training episodes since the last selection, once each member has enough."""
-    window, members = ensemble.config.run.select_window, ensemble.progress.members
-    if min(len(member.window) for member in members) < window:
-        return None
-    returns = np.array([member.window[-window:] for member in members])
-    for member in members:
-        member.window = []
-    return _select(ensemble, returns, paired=False)
-
-
-def on_trials(ensemble: Ensemble) -> Selection | None:
-    """Select on extra noise-free episodes with the same starts for each."""
-    config, progress = ensemble.config, ensemble.progress
-    if progress.step < progress.next_selection or progress.step >= ensemble.budget:
-        return None
-    every = config.run.select_every * config.steps_per_count
-    returns = [_trial(ensemble, k) for k in range(config.run.members)]
-    progress.next_selection = (progress.step // every + 1) * every
-    # A selection that the budget cut short decides nothing.
-    if progress.step >= ensemble.budget:
-        return None
-    return _select(ensemble, np.array(returns), paired=True)
-
-
-def _trial(ensemble: Ensemble, k: int) -> list[float]:
-    """Returns of noise-free episodes of a member, from the starts of this selection."""
-    run, progress = ensemble.config.run, ensemble.progress
-    if ensemble.trial_env is None:
-        ensemble.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
-    env, first = ensemble.trial_env, progress.selections * run.select_window
-    counted = run.count_selection_steps
-    limit = ensemble.budget - progress.step if counted else inf
-    with blame(k, progress.step):
-        trial = rollouts(ensemble.current(k).act, env, run.select_window, first, limit=limit)
-    progress.selection_steps += sum(trial.lengths)
-    progress.free_steps += 0 if counted else sum(trial.lengths)
-    return trial.returns
-
-
-def _select(ensemble: Ensemble, returns: Returns, paired: bool) -> Selection:
-    """Copy by the rule's choice from returns (K, episodes); the winner is the champion."""
-    run, progress = ensemble.config.run, ensemble.progress
-    means = returns.mean(axis=1)
-    parents = RULES[run.rule](means, ensemble.rule_stream)
-    if run.rule != "none":
-        ensemble.descend(parents)
-        progress.champion = champion(means, parents)
-    progress.selections += 1
-    gap, error = measure(returns, progress.variances, paired)
-    return Selection(parents.tolist(), progress.champion, returns.tolist(), gap, error)
-
-
-def champion(means: Returns, parents: Parents) -> int:
+def find_champion(means: Returns, parents: Parents) -> int:
     """The best member that went on from itself; if none did, the place of the best parent."""
     themselves = np.flatnonzero(parents == np.arange(len(parents)))
     if len(themselves):

@@ -1,1 +1,1 @@
-"""One learner as a compiled program, and what is around it: backend, precision, normaliser."""
+"""A compiled learner, the states of its members, and what is around it."""

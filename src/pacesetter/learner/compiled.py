@@ -1,12 +1,14 @@
 """One learner compiled once and called for each of K members, whose states are a plain list.
 
-Members share a program, not a call: alone, one is quicker so than under `vmap`, and several that
-are called from threads of their own keep more of the cores busy than one product split over them.
-Every random key is (purpose, the member's own count of cycles, member) folded into the run's key,
-so a waiting member shifts nobody's stream and no state ever holds a key.
+Members share a program, not a call. One member alone is faster than under `vmap`, and several in
+threads keep more of the cores busy than one product that is split over the cores.
+Every random key folds (purpose, number of the member's call, member) into the run's key, so a
+waiting member shifts nobody's stream and no state ever holds a key.
 """
 
+import copy
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,7 +20,7 @@ import numpy as np
 from pacesetter.algorithms.contract import Array, Learner, State
 from pacesetter.batch import Layout
 from pacesetter.envs import Environment
-from pacesetter.learner.backend import compiler_options
+from pacesetter.errors import UsageError
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
 from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
@@ -27,41 +29,41 @@ from pacesetter.types import Floats
 KEYS = 1024  # made in one call: in the update itself they would come before every product
 
 
-class Draw(IntEnum):
+class KeyUse(IntEnum):
     """What a key is for."""
 
     INIT = 0
     UPDATE = 1
 
 
-class Cycle(NamedTuple):
-    """What a cycle of one member gave."""
+class MemberUpdate(NamedTuple):
+    """What one call of a member's update gave."""
 
     state: State
     losses: Floats  # (losses,)
-    error: Array  # (U, B)
-    acting: Any  # what it acts with now
+    td_error: Array  # (U, B)
+    policy_params: Any  # what it acts with now
 
 
-class Population:
-    """The compiled functions of one algorithm: the same program for every member and seed."""
+class CompiledLearner:
+    """The compiled functions of one learner: the same program for every member and seed."""
 
     def __init__(
         self,
-        algorithm: Learner,
+        learner: Learner,
         layout: Layout,
         seed: int,
         normalize: bool,
         precision: str = "f32",
     ) -> None:
-        self.algorithm, self.layout, self.normalize = algorithm, layout, normalize
+        self.learner, self.layout, self.normalize = learner, layout, normalize
         self.key = jax.random.key(seed)
-        self._init = jax.jit(lambda key, member: algorithm.init(_key(key, Draw.INIT, 0, member)))
-        self._acting = jax.jit(algorithm.policy_params)
+        self._init = jax.jit(lambda key, member: learner.init(_key(key, KeyUse.INIT, 0, member)))
+        self._policy_params = jax.jit(learner.policy_params)
         self._fold = jax.jit(self._fold_keys)
         self._keys = lru_cache(maxsize=1024)(self._make_keys)
         update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
-        self._update = jax.jit(update, donate_argnums=0, compiler_options=compiler_options())
+        self._update = jax.jit(update, donate_argnums=0)
 
     def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""
@@ -69,45 +71,49 @@ class Population:
 
     def policy_params(self, states: Sequence[State]) -> list[Any]:
         """What each member acts with, as NumPy arrays that no later update touches."""
-        return [jax.tree.map(np.array, self._acting(state)) for state in states]
+        return [jax.tree.map(np.array, self._policy_params(state)) for state in states]
 
     def update(
         self,
         state: State,
         member: int,
-        cycle: int,
+        call: int,
         rows: Floats,
         weight: Floats | None,
         statistics: Statistics,
         extra: dict[str, Any] | None = None,
-    ) -> Cycle:
-        """One cycle of a member on rows (U, B, width); the given state is used up.
+        scales: dict[str, float] | None = None,
+    ) -> MemberUpdate:
+        """One call of a member's update on rows (U, B, width); the given state is used up.
 
-        `extra` are fields of the batch that are not in rows. Members may be called from threads.
+        `extra` are fields of the batch that are not in rows, and `scales` factors of learning
+        rates. Members may be called from threads.
         """
-        key = self._keys(member, cycle // KEYS)[cycle % KEYS]
-        inputs = (rows, weight, statistics, extra or {})
-        state, losses, error, acting = self._update(state, *inputs, key)
-        return Cycle(state, np.asarray(losses), error, acting)  # NumPy waits for the result
+        key = self._keys(member, call // KEYS)[call % KEYS]
+        inputs = (rows, weight, statistics, extra or {}, scales or {})
+        state, losses, td_error, params = self._update(state, *inputs, key)
+        return MemberUpdate(
+            state, np.asarray(losses), td_error, params
+        )  # NumPy waits for the result
 
     def loss_names(
         self, state: State, rows: Floats | None = None, extra: dict[str, Any] | None = None
     ) -> list[str]:
         """Names of the columns of losses, in order; of rows only the shape matters."""
         if rows is None:
-            rows = np.zeros((self.algorithm.updates_per_call, 1, self.layout.width), np.float32)
+            rows = np.zeros((self.learner.updates_per_call, 1, self.layout.width), np.float32)
         size = self.layout.spec.observation_size
         statistics = (np.zeros(size), np.ones(size))
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
             batch = self._batch(rows, None, statistics)._replace(**extra)
-            return self.algorithm.update(state, batch, self.key).losses
+            return self.learner.update(state, batch, self.key).losses
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))
 
     def policy(self, state: State, env: Environment, statistics: Statistics) -> Policy:
         """What acts without noise in an env like this one, in NumPy alone."""
-        actors = self.algorithm.policy(state)
+        actors = self.learner.policy(state)
         scale = statistics if self.normalize else None
         layers = unstack(actors)
         return Policy(
@@ -122,8 +128,8 @@ class Population:
     # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
 
     def _fold_keys(self, key: Array, first: Any, member: Any) -> Array:
-        cycles = first + jnp.arange(KEYS, dtype=jnp.uint32)
-        keys = jax.vmap(lambda cycle: _key(key, Draw.UPDATE, cycle, member))(cycles)
+        calls = first + jnp.arange(KEYS, dtype=jnp.uint32)
+        keys = jax.vmap(lambda call: _key(key, KeyUse.UPDATE, call, member))(calls)
         return jax.random.key_data(keys)
 
     def _update_one(
@@ -133,15 +139,17 @@ class Population:
         weight: Array | None,
         statistics: Any,
         extra: dict[str, Any],
+        scales: dict[str, Array],
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
         whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
-        update = self.algorithm.update(state, batch, whole)
+        learner = _scaled(self.learner, scales) if scales else self.learner
+        update = learner.update(state, batch, whole)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
-        acting = jax.tree.map(jnp.copy, self.algorithm.policy_params(update.state))
-        return update.state, losses, update.td_error, acting
+        params = jax.tree.map(jnp.copy, self.learner.policy_params(update.state))
+        return update.state, losses, update.td_error, params
 
     def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
         batch = self.layout.unpack(rows)
@@ -158,7 +166,18 @@ class Population:
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
-def _key(key: Array, draw: Draw, cycle: Any, member: Any) -> Array:
-    for number in (int(draw), cycle, member):
+def _key(key: Array, use: KeyUse, call: Any, member: Any) -> Array:
+    for number in (int(use), call, member):
         key = jax.random.fold_in(key, number)
     return key
+
+
+def _scaled(learner: Any, scales: dict[str, Array]) -> Any:
+    """The learner with learning rates multiplied by factors, which may be traced."""
+    rates = [field.name for field in fields(learner.hyper) if field.name.endswith("learning_rate")]
+    hyper = copy.copy(learner.hyper)
+    for name, scale in scales.items():
+        if name not in rates:
+            raise UsageError(f"rule: cannot scale '{name}' of members; allowed: {', '.join(rates)}")
+        object.__setattr__(hyper, name, getattr(hyper, name) * scale)  # it is frozen, and checked
+    return replace(learner, hyper=hyper)

@@ -1,31 +1,56 @@
-"""Running mean and deviation of observations, in float64, shared by all members."""
+"""Running mean and standard deviation of observations, in float64, shared by all members."""
+
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pacesetter.types import Floats
+from pacesetter.policy import normalize
+from pacesetter.types import Arrays, Floats, Reals
 
 Statistics = tuple[Floats, Floats]
 
 
 class Normalizer:
-    """Welford's sums; evaluation never adds to them."""
+    """Welford's sums; evaluation never adds to them. Disabled, it changes nothing."""
 
-    def __init__(self, size: int) -> None:
-        self.sums: NDArray[np.float64] = np.zeros((3, size))  # count, mean, squared deviations
+    def __init__(self, size: int, enabled: bool) -> None:
+        self.enabled = enabled
+        self.sums: Reals = np.zeros((3, size))  # count, mean, squared deviations
+        self._statistics: Statistics | None = None  # of these sums, once asked for
 
     def add(self, observation: Floats) -> None:
-        """Take in one observation (O,)."""
+        """Add one observation (O,)."""
+        if not self.enabled:
+            return
         count, mean, squares = self.sums
         count += 1
         change = observation - mean
         mean += change / count
         squares += change * (observation - mean)
+        self._statistics = None
 
     def statistics(self) -> Statistics:
-        """Mean and deviation, each (O,); 0 and 1 before there are two observations."""
-        count, mean, squares = self.sums
-        if count[0] < 2:
-            return np.zeros(len(mean), np.float32), np.ones(len(mean), np.float32)
-        deviation = np.sqrt(squares / count + 1e-8)
-        return mean.astype(np.float32), deviation.astype(np.float32)
+        """Mean and standard deviation, each (O,); 0 and 1 before there are two observations."""
+        if self._statistics is None:
+            count, mean, squares = self.sums
+            if count[0] < 2:
+                found = np.zeros(len(mean), np.float32), np.ones(len(mean), np.float32)
+            else:
+                deviation = np.sqrt(squares / count + 1e-8)
+                found = mean.astype(np.float32), deviation.astype(np.float32)
+            self._statistics = found
+        return self._statistics
+
+    def scale(self, observation: Floats) -> Floats:
+        """An observation as learners see it."""
+        return normalize(observation, *self.statistics()) if self.enabled else observation
+
+    def arrays(self) -> Arrays:
+        return {"sums": self.sums}
+
+    def table(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
+        """The inverse of `arrays`."""
+        self.sums, self._statistics = arrays["sums"], None

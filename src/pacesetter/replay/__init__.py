@@ -1,1 +1,1 @@
-"""The replay: its ring of rows, rows over several steps, and how rows are sampled."""
+"""The replay: its ring of transitions, transitions over several steps, and how it is sampled."""

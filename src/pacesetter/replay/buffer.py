@@ -13,18 +13,20 @@ import numpy as np
 
 from pacesetter.batch import Layout, Transition
 from pacesetter.errors import UsageError
-from pacesetter.replay.sampler import Drawing, Uniform
+from pacesetter.replay.by_return import ByReturn
+from pacesetter.replay.prioritized import MEASURES, ByError
+from pacesetter.replay.sampler import Sampler, Uniform
 from pacesetter.storage import digest
 from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
-MEMBERS = 1_000  # at most, each of which may add n_step rows before the next checkpoint
-SLACK = 2 * (UNCOMMITTED + MEMBERS) + BLOCK
+MAX_ROWS_PER_TICK = 1_000  # of all members together, before the next checkpoint
+SLACK = 2 * (UNCOMMITTED + MAX_ROWS_PER_TICK) + BLOCK
 
 
 class Sample(NamedTuple):
-    """Drawn rows (..., width), their numbers and their importance (None: all 1)."""
+    """Sampled rows (..., width), their numbers and their importance (None: all 1)."""
 
     rows: Floats
     numbers: Numbers
@@ -40,13 +42,13 @@ class Replay:
         layout: Layout,
         capacity: int,
         budget: int,
-        drawing: Drawing | None = None,
-        tick: int | None = None,
+        sampler: Sampler | None = None,
+        rows_per_tick: int | None = None,
     ) -> None:
-        """`tick` is how many rows a tick adds at most."""
-        self.tick = MEMBERS if tick is None else tick
+        """`budget` is how many rows the whole run adds at most, `rows_per_tick` one tick."""
+        self.rows_per_tick = MAX_ROWS_PER_TICK if rows_per_tick is None else rows_per_tick
         self.path, self.layout, self.capacity = path, layout, capacity
-        self.drawing = drawing or Uniform()
+        self.sampler = sampler or Uniform()
         self.slots = capacity + SLACK
         self.head = 0  # rows added so far
         self.committed = 0  # rows that the latest checkpoint covers
@@ -61,13 +63,13 @@ class Replay:
 
     @property
     def window(self) -> range:
-        """The numbers of the rows that can be drawn."""
+        """The numbers of the rows that can be sampled."""
         return range(self.head - len(self), self.head)
 
     @property
     def must_commit(self) -> bool:
         """Whether more rows would eat into what the checkpoint before the latest needs."""
-        return self.head - self.committed + self.tick >= UNCOMMITTED + MEMBERS
+        return self.head - self.committed + self.rows_per_tick >= UNCOMMITTED + MAX_ROWS_PER_TICK
 
     def add(self, transition: Transition, member: int = 0) -> None:
         """Store one transition of a member."""
@@ -76,7 +78,7 @@ class Replay:
     def append(self, row: Floats, earned: float = 0.0, member: int = 0) -> None:
         """Store one transition that is packed already."""
         self.rows[self.head % self.slots] = row
-        self.drawing.add(self.head, member, earned)
+        self.sampler.add(self.head, member, earned)
         self.head += 1
 
     def padded(self, size: int) -> Floats:
@@ -87,17 +89,17 @@ class Replay:
         return rows
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...], done: float = 0.0) -> Sample:
-        """Rows drawn from the window; `done` is the share of the horizon that has passed."""
-        numbers, weight = self.drawing.draw(rng, shape, self.window, done)
+        """Rows sampled from the window; `done` is the share of the horizon that has passed."""
+        numbers, weight = self.sampler.sample(rng, shape, self.window, done)
         return Sample(self.rows.take(numbers % self.slots, axis=0), numbers, weight)
 
-    def feedback(self, numbers: Numbers, error: Floats) -> None:
-        """The errors that an update found in drawn rows, before any further row is added."""
-        self.drawing.feedback(numbers, error)
+    def feedback(self, numbers: Numbers, td_error: Floats) -> None:
+        """The TD errors that an update found in sampled rows, before any further row is added."""
+        self.sampler.feedback(numbers, td_error)
 
     def arrays(self) -> Arrays:
         """What a checkpoint must hold besides the rows."""
-        return self.drawing.arrays(self.window)
+        return self.sampler.arrays(self.window)
 
     def commit(self) -> dict[str, Any]:
         """Put all rows on disk; what a checkpoint must know to find and verify them again."""
@@ -113,6 +115,8 @@ class Replay:
         first = self._first_block()
         return {"head": self.head, "blocks": [first, *self.hashes[first:]], "tail": tail}
 
+    table = commit  # as the part of a checkpoint that it is
+
     def restore(self, table: dict[str, Any], arrays: Arrays | None = None) -> None:
         """Take up the ring where a checkpoint left it, or refuse rows that are not its own."""
         self.head = self.committed = int(table["head"])
@@ -123,7 +127,7 @@ class Replay:
                 raise UsageError(f"{self.path}: damaged: rows from {block * BLOCK} on differ")
         if self._hash(self.head // BLOCK * BLOCK, self.head) != table["tail"]:
             raise UsageError(f"{self.path}: damaged: its newest rows differ")
-        self.drawing.restore(arrays or {}, self.window)
+        self.sampler.restore(arrays or {}, self.window)
 
     def close(self) -> None:
         """Let go of the file, which is unmapped with its last user."""
@@ -142,6 +146,16 @@ class Replay:
     def _hash(self, start: int, stop: int) -> str:
         spans = self._spans(start, stop)
         return digest(np.concatenate([self.rows[a:b] for a, b in spans])) if spans else ""
+
+
+def make_sampler(hyper: Any, size: int) -> Sampler:
+    """The sampler that settings ask for, of a replay with at most `size` rows."""
+    exponent, importance = hyper.exponents
+    if hyper.replay == "uniform":
+        return Uniform()
+    if hyper.replay == "return":
+        return ByReturn(size, exponent, importance, hyper.replay_to_go)
+    return ByError(size, exponent, importance, MEASURES[hyper.replay])
 
 
 def _map_file(path: Path, size: int) -> mmap.mmap:

@@ -1,10 +1,10 @@
-"""Rows drawn by the return of their episode, or by the return from them on."""
+"""Rows sampled by the return of their episode, or by their return-to-go."""
 
 from collections import deque
 
 import numpy as np
 
-from pacesetter.replay.sampler import Drawn, weigh
+from pacesetter.replay.sampler import SampledIndices, importance_weights
 from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 FLOOR = 0.05  # added to a rank, so that no row is lost
@@ -13,13 +13,13 @@ REFERENCE = 4096  # rows that returns-to-go are ranked among
 
 
 class ByReturn:
-    """Rows of well-paid episodes more often: the future work of the Multi-TD3 paper.
+    """Samples episodes with high returns more often: the future work of the Multi-TD3 paper.
 
-    An episode's rank u in (0, 1) is that of its return among the finished episodes in the window,
-    ties in their middle; its rows have priority (0.05 + u) ** exponent, those of running episodes
-    as in the middle. With `to_go` each row has its own rank, by the undiscounted return from it to
-    the episode's end. Ranks know neither scale nor sign of returns. Priorities are bounded, so
-    rows are drawn uniformly and kept in proportion: exact, and what left the window needs no care.
+    An episode's rank u in (0, 1) is that of its return among the finished episodes in the window;
+    ties share the mean rank. Its rows have priority (0.05 + u) ** exponent; rows of running
+    episodes take u = 0.5. With `to_go` each row has its own rank, by its undiscounted
+    return-to-go. Ranks depend on neither scale nor sign of returns. Priorities are bounded, so
+    rejection sampling is exact, and rows that left the window need no care.
     """
 
     def __init__(self, size: int, exponent: float, importance: float, to_go: bool) -> None:
@@ -47,11 +47,13 @@ class ByReturn:
             gone.append(self.ended.popleft()[0])
         if self.to_go:
             self.ranking = np.sort(self._sampled())
-        else:  # kept sorted: sorting all anew would cost more with every short episode
+        else:  # kept sorted: a full sort would cost more with every short episode
             left = np.delete(self.ranking, [self.ranking.searchsorted(score) for score in gone])
             self.ranking = np.insert(left, left.searchsorted(total), total)
 
-    def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
+    def sample(
+        self, rng: np.random.Generator, shape: Shape, window: range, done: float
+    ) -> SampledIndices:
         count = int(np.prod(shape))
         found: Numbers = np.zeros(0, np.int64)
         priorities: Reals = np.zeros(0)
@@ -61,8 +63,8 @@ class ByReturn:
             kept = rng.random(2 * count) < priority
             found = np.concatenate([found, numbers[kept]])
             priorities = np.concatenate([priorities, priority[kept]])
-        weight = weigh(priorities[:count].reshape(shape), self.importance, done)
-        return Drawn(found[:count].reshape(shape), weight)
+        weight = importance_weights(priorities[:count].reshape(shape), self.importance, done)
+        return SampledIndices(found[:count].reshape(shape), weight)
 
     def priority(self, numbers: Numbers) -> Reals:
         """Priorities of rows, as shares of the largest that there can be."""
@@ -72,7 +74,7 @@ class ByReturn:
         rank = np.where(np.isnan(scores), MIDDLE, rank)
         return ((FLOOR + rank) / (FLOOR + 1)) ** self.exponent
 
-    def feedback(self, numbers: Numbers, error: Floats) -> None: ...
+    def feedback(self, numbers: Numbers, td_error: Floats) -> None: ...
 
     def arrays(self, window: range) -> Arrays:
         rows = [(member, *row) for member, rows in self.running.items() for row in rows]

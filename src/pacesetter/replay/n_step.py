@@ -1,4 +1,4 @@
-"""Rows that reach over several steps, built for each member as its steps come in."""
+"""Transitions over several steps (`--n-step`), built for each member as its steps come in."""
 
 from typing import Any
 
@@ -8,15 +8,15 @@ from pacesetter.batch import Transition
 from pacesetter.types import Arrays
 
 
-class Pending:
-    """One member's rows that still wait for steps, oldest first; each is shorter by a step."""
+class NStepQueue:
+    """One member's transitions that still wait for steps, oldest first."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
         self.rows: list[Transition] = []
 
     def push(self, step: Transition) -> list[Transition]:
-        """Take in a step; the rows that are complete with it, which at an episode's end are all."""
+        """Add a step; the transitions that are now complete, at an episode's end all of them."""
         if self.steps == 1:
             return [step]
         self.rows = [_extend(row, step) for row in self.rows] + [step]
@@ -25,16 +25,19 @@ class Pending:
         return [self.rows.pop(0)] if len(self.rows) == self.steps else []
 
     def flush(self) -> list[Transition]:
-        """All rows as they are, because no further step will follow."""
+        """All transitions as they are, because no further step will follow."""
         rows, self.rows = self.rows, []
         return rows
 
     def arrays(self) -> Arrays:
-        """The waiting rows, field by field."""
+        """The waiting transitions, field by field."""
         fields = zip(Transition._fields, zip(*self.rows, strict=True), strict=False)
         return {name: np.array(values) for name, values in fields if values[0] is not None}
 
-    def restore(self, arrays: Arrays) -> None:
+    def table(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays`."""
         columns: list[Any] = list(arrays.values())
         rows = zip(*columns, strict=True)
@@ -42,7 +45,7 @@ class Pending:
 
 
 def _extend(row: Transition, step: Transition) -> Transition:
-    """A row with one more step, seen from where it led; only its own end would make that 0."""
+    """A transition that waits, with one more step."""
     return row._replace(
         reward=row.reward + row.discount * step.reward,
         next_observation=step.next_observation,

@@ -1,4 +1,4 @@
-"""Rows drawn by their last TD error: PER and LAP.
+"""Rows sampled by their last TD error: PER and LAP.
 
 Priorities lie at `number % size`, so a new row takes the place of the one that left the window.
 """
@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pacesetter.replay.sampler import Drawn, weigh
+from pacesetter.replay.sampler import SampledIndices, importance_weights
 from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
-BLOCK = 32  # priorities that are summed together
-REFRESH = 250  # updates after which the priority of new rows is measured anew (TD7)
+BLOCK = 32  # priorities per sum
+REFRESH = 250  # updates after which the priority of new rows is computed again (TD7)
 SMALLEST = 1e-6  # added to an error, so that no row is lost (Schaul et al. 2016, 3.3)
 
 
@@ -34,15 +34,15 @@ class ByError:
     (Fujimoto et al. 2020, sfujim/TD7) with its own measure of the error and without weights.
 
     Departures: weights are divided by the largest of their minibatch, not of the whole replay;
-    new rows take the largest priority, measured anew every 250 updates for PER too, lest one
-    early error puts them first for ever; draws are stratified for LAP too.
+    new rows take the largest priority, computed again every 250 updates for PER too, so that one
+    early error does not put them first for ever; sampling is stratified for LAP too.
     """
 
     def __init__(
         self, size: int, exponent: float, importance: float, measure: Callable[[Reals], Reals]
     ) -> None:
         self.exponent, self.importance, self.measure = exponent, importance, measure
-        self.sums = Sums(size)
+        self.tree = SumTree(size)
         self.largest = 1.0
         self.updates = 0
         self.known = 0  # rows below this number have a priority
@@ -51,45 +51,49 @@ class ByError:
 
     def end(self, member: int, total: float | None) -> None: ...
 
-    def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
+    def sample(
+        self, rng: np.random.Generator, shape: Shape, window: range, done: float
+    ) -> SampledIndices:
         self._admit(window)
         strata = (np.arange(shape[-1]) + rng.random(shape)) / shape[-1]
-        places = self.sums.find(strata)
+        places = self.tree.find(strata)
         newest = window.stop - 1
-        numbers = newest - (newest - places) % self.sums.size
-        return Drawn(numbers, weigh(self.sums.values[places], self.importance, done))
+        numbers = newest - (newest - places) % self.tree.size
+        return SampledIndices(
+            numbers, importance_weights(self.tree.values[places], self.importance, done)
+        )
 
-    def feedback(self, numbers: Numbers, error: Floats) -> None:
-        priority = self.measure(error.astype(np.float64)) ** self.exponent
-        self.sums.put(numbers % self.sums.size, priority)
-        before, self.updates = self.updates, self.updates + len(error)
+    def feedback(self, numbers: Numbers, td_error: Floats) -> None:
+        priority = self.measure(td_error.astype(np.float64)) ** self.exponent
+        self.tree.put(numbers % self.tree.size, priority)
+        before, self.updates = self.updates, self.updates + len(td_error)
         if self.updates // REFRESH > before // REFRESH:
-            self.largest = float(self.sums.values.max())
+            self.largest = float(self.tree.values.max())
         else:
             self.largest = max(self.largest, float(priority.max()))
 
     def arrays(self, window: range) -> Arrays:
         self._admit(window)
         counters = np.array([self.largest, self.updates])
-        return {"values": self.sums.values[: len(window)], "counters": counters}
+        return {"values": self.tree.values[: len(window)], "counters": counters}
 
     def restore(self, arrays: Arrays, window: range) -> None:
-        self.sums = Sums(max(self.sums.size, len(window)))
-        self.sums.put(np.arange(len(window)), arrays["values"])
+        self.tree = SumTree(max(self.tree.size, len(window)))
+        self.tree.put(np.arange(len(window)), arrays["values"])
         self.largest, self.updates = float(arrays["counters"][0]), int(arrays["counters"][1])
         self.known = window.stop
 
     def _admit(self, window: range) -> None:
-        """Give rows that came since the last draw the largest priority, all at once."""
+        """Give rows that were added since the last sample the largest priority, all at once."""
         new = np.arange(max(self.known, window.start), window.stop)
-        self.sums.put(new % self.sums.size, np.full(len(new), self.largest))
+        self.tree.put(new % self.tree.size, np.full(len(new), self.largest))
         self.known = window.stop
 
 
-class Sums:
-    """Priorities (size,) and the sum of each block of them; two levels are the quickest in NumPy.
+class SumTree:
+    """Priorities (size,) and the sum of each block of them; two levels are fastest in NumPy.
 
-    A sum is always taken anew over its block, so it is a function of the priorities alone.
+    A sum is always computed over its whole block, so it is a function of the priorities alone.
     """
 
     def __init__(self, size: int) -> None:

@@ -1,7 +1,7 @@
-"""How rows of a replay are drawn: what every kind of drawing does, and the uniform one.
+"""Which transitions of a replay a minibatch takes: the interface of every sampler, and the uniform.
 
-Each kind is one small object beside the ring: it hears of every row and episode, draws row
-numbers from the window, takes the errors of an update and goes to the checkpoint as arrays.
+A sampler stands beside the ring. It hears of every row and episode, samples row numbers from the
+window, takes the errors of an update and goes to the checkpoint as arrays.
 """
 
 from typing import NamedTuple, Protocol
@@ -11,30 +11,32 @@ import numpy as np
 from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 
-class Drawn(NamedTuple):
+class SampledIndices(NamedTuple):
     """Row numbers of a shape, and their importance weights (None: all 1)."""
 
     numbers: Numbers
     weight: Floats | None
 
 
-class Drawing(Protocol):
+class Sampler(Protocol):
     """What the replay and the members tell of rows, and ask for."""
 
     def add(self, number: int, member: int, earned: float) -> None:
-        """Row `number` was written by a member whose episode had earned so much before it."""
+        """A member wrote row `number`; its episode had returned `earned` before that step."""
         ...
 
     def end(self, member: int, total: float | None) -> None:
-        """A member's episode ended with a return; None if it broke off unfinished."""
+        """A member's episode ended with a return; None if it was abandoned unfinished."""
         ...
 
-    def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
+    def sample(
+        self, rng: np.random.Generator, shape: Shape, window: range, done: float
+    ) -> SampledIndices:
         """Minibatches (..., B) from the rows in the window; `done` is the share of the horizon."""
         ...
 
-    def feedback(self, numbers: Numbers, error: Floats) -> None:
-        """Absolute errors (U, B) of drawn rows, before any further row is added."""
+    def feedback(self, numbers: Numbers, td_error: Floats) -> None:
+        """Absolute TD errors (U, B) of sampled rows, before any further row is added."""
         ...
 
     def arrays(self, window: range) -> Arrays:
@@ -47,16 +49,18 @@ class Drawing(Protocol):
 
 
 class Uniform:
-    """Every row of the window alike, with replacement."""
+    """Samples every row of the window with the same probability, with replacement."""
 
     def add(self, number: int, member: int, earned: float) -> None: ...
 
     def end(self, member: int, total: float | None) -> None: ...
 
-    def draw(self, rng: np.random.Generator, shape: Shape, window: range, done: float) -> Drawn:
-        return Drawn(window.start + rng.integers(len(window), size=shape), None)
+    def sample(
+        self, rng: np.random.Generator, shape: Shape, window: range, done: float
+    ) -> SampledIndices:
+        return SampledIndices(window.start + rng.integers(len(window), size=shape), None)
 
-    def feedback(self, numbers: Numbers, error: Floats) -> None: ...
+    def feedback(self, numbers: Numbers, td_error: Floats) -> None: ...
 
     def arrays(self, window: range) -> Arrays:
         return {}
@@ -64,10 +68,10 @@ class Uniform:
     def restore(self, arrays: Arrays, window: range) -> None: ...
 
 
-def weigh(priority: Reals, importance: float, done: float) -> Floats | None:
-    """Importance weights (N P) ** -beta over the largest of each minibatch (..., B).
+def importance_weights(priority: Reals, importance: float, done: float) -> Floats | None:
+    """Weights (N P) ** -beta over the largest of each minibatch (..., B).
 
-    Beta goes from `importance` to 1 with the share `done` of the horizon; from 0 it never starts.
+    Beta goes from `importance` to 1 with the share `done` of the horizon; 0 switches weights off.
     """
     if importance == 0:
         return None

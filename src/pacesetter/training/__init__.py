@@ -1,1 +1,1 @@
-"""The training loop and what it keeps: replay, normaliser, population, checkpoints."""
+"""A run: the trainer, its checkpoints, and the on-policy loop."""

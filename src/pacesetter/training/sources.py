@@ -71,7 +71,9 @@ class AllSteps:
 
     def open(self, path: Path, budget: int) -> None:
         """Make or find the ring."""
-        self.replays.append(Replay(path, self.layout, self.size, budget, tick=self.rollout))
+        self.replays.append(
+            Replay(path, self.layout, self.size, budget, rows_per_tick=self.rollout)
+        )
 
     def keep(self, rows: Floats) -> None:
         """Put a rollout into the ring."""

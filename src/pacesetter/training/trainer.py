@@ -9,7 +9,8 @@ import jax
 
 from pacesetter.budget import out_of_time
 from pacesetter.config import read_file, resolve
-from pacesetter.ensemble.members import Ensemble
+from pacesetter.ensemble.loop import Loop
+from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError, blame
@@ -21,7 +22,7 @@ from pacesetter.runs import RunDirectory, find
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint
-from pacesetter.training.on_policy import Iterations
+from pacesetter.training.on_policy import OnPolicyLoop
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class Trainer:
         self._begin()
         self.directory.create(self.config, jax.default_backend())
         try:
-            self.ensemble.open_replays(self.directory.state_file.parent)
-            checkpoint.save(self.ensemble, self.directory)
+            self.loop.open_replays(self.directory.state_file.parent)
+            checkpoint.save(self.loop, self.config, self.directory)
         except BaseException:
             self.directory.remove()
             raise
@@ -92,8 +93,8 @@ class Trainer:
         self.directory.lock()
         try:
             self.directory.sweep()
-            self.ensemble.open_replays(self.directory.state_file.parent)
-            self.notes = checkpoint.restore(self.ensemble, self.directory)
+            self.loop.open_replays(self.directory.state_file.parent)
+            self.notes = checkpoint.restore(self.loop, self.config, self.directory)
             if self.progress.step > self.budget:
                 raise UsageError(
                     f"steps: the run has made {self.progress.step:,} already; give more"
@@ -114,7 +115,7 @@ class Trainer:
             for index in range(hyper.parallel_envs if on_policy else run.members)
         ]
         envs[0].check()
-        self.ensemble = (Iterations if on_policy else Ensemble)(self.config, envs)
+        self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []
         self._stopping = self._closed = False
@@ -136,9 +137,9 @@ class Trainer:
                     break
                 if self._save_is_due():
                     self.save()
-                selection = self.ensemble.tick()
+                selection = self.loop.tick()
                 if selection is not None:
-                    self._emit("select", selection._asdict())
+                    self._emit("select", selection.row())
             self.save()
         except GeneratorExit:
             self.save()
@@ -153,19 +154,19 @@ class Trainer:
     @property
     def progress(self) -> Progress:
         """All counters."""
-        return self.ensemble.progress
+        return self.loop.progress
 
     @property
     def budget(self) -> int:
         """Env steps in all, of every member and, where it is counted, of selection."""
-        return self.ensemble.budget
+        return self.loop.budget
 
     @property
     def finished(self) -> bool:
-        """Whether the budget of steps, with the updates they owe, or of time is spent."""
+        """Whether the budget of steps, with the updates that are due, or of time is spent."""
         if out_of_time(vars(self.config.run), self.progress.wall_seconds):
             return True
-        return self.progress.step >= self.budget and not self.ensemble.behind
+        return self.progress.step >= self.budget and not self.loop.has_due_updates
 
     def stop(self) -> None:
         """Ask for the end after the running tick; may be called from a signal handler."""
@@ -175,14 +176,14 @@ class Trainer:
         """Write a checkpoint now."""
         self._refuse_closed()
         self._clock.tell(self.progress)
-        checkpoint.save(self.ensemble, self.directory)
+        checkpoint.save(self.loop, self.config, self.directory)
         self._saved_at = self.progress.wall_seconds
 
     def close(self) -> None:
         """Let go of envs, files and the folder."""
         self._closed = True
         try:
-            self.ensemble.close()
+            self.loop.close()
             if self._evaluation_env is not None:
                 self._evaluation_env.close()
         finally:
@@ -196,7 +197,7 @@ class Trainer:
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
-        policy = self.ensemble.policy(self.progress.champion if member is None else member)
+        policy = self.loop.policy(self.progress.champion if member is None else member)
         run = self.config.run
         names = ("env", "env_kwargs", "algorithm", "name", "seed")
         policy.about.update({name: getattr(run, name) for name in names})
@@ -210,9 +211,9 @@ class Trainer:
         pending = ending and bool(progress.ended or progress.losses)
         if progress.step >= progress.next_train or pending:
             progress.next_train = (progress.step // TRAIN_ROW_EVERY + 1) * TRAIN_ROW_EVERY
-            self._emit("train", progress.training_values(self.ensemble.loss_names))
+            self._emit("train", self.loop.training_values())
         last = ending and progress.last_evaluation < progress.step
-        # The last one waits for all updates that the budget's last steps owe.
+        # The last one waits for all updates that the budget's last steps made due.
         if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
             self._evaluate(ending)
             every = self.config.run.eval_every * self.config.steps_per_count
@@ -246,11 +247,11 @@ class Trainer:
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
-        report = Report(kind, self.progress.step, values, self.ensemble.ledger())
+        report = Report(kind, self.progress.step, values, self.loop.ledger())
         self.directory.append(report.row())
         self._reports.append(report)
 
     def _save_is_due(self) -> bool:
         waited = self.progress.wall_seconds - self._saved_at
-        full = any(replay.must_commit for replay in self.ensemble.replays)
+        full = any(replay.must_commit for replay in self.loop.replays)
         return full or waited >= self.config.run.checkpoint_every

@@ -1,4 +1,4 @@
-"""Every way of drawing rows against the formula it stands for, written out once more."""
+"""Every way of sampler rows against the formula it stands for, written out once more."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,10 @@ import pytest
 from scipy import stats
 from short_runs import TINY, content, run_to_end
 
-from pacesetter.replay.buffer import Columns, Replay
+from pacesetter.batch import Layout, Spec, Transition
+from pacesetter.replay.buffer import Replay, make_sampler
 from pacesetter.replay.by_return import ByReturn
-from pacesetter.replay.priorities import choose
-from pacesetter.replay.prioritized import MEASURES, ByError, Sums
+from pacesetter.replay.prioritized import MEASURES, ByError, SumTree
 from pacesetter.replay.sampler import Uniform
 from pacesetter.settings import OffPolicy
 from pacesetter.training.trainer import Trainer
@@ -26,22 +26,22 @@ def per(
     return ByError(size, exponent, importance, MEASURES[kind])
 
 
-def grow(drawing: Any, count: int, member: int = 0) -> range:
+def grow(sampler: Any, count: int, member: int = 0) -> range:
     """Add rows and give the window."""
-    for number in range(drawing.known, drawing.known + count):
-        drawing.add(number, member, 0.0)
-    return range(max(0, drawing.known + count - drawing.sums.size), drawing.known + count)
+    for number in range(sampler.known, sampler.known + count):
+        sampler.add(number, member, 0.0)
+    return range(max(0, sampler.known + count - sampler.tree.size), sampler.known + count)
 
 
-def tell(drawing: Any, window: range, errors: Any) -> None:
+def tell(sampler: Any, window: range, errors: Any) -> None:
     """Draw once, so that all rows are known, then give each the error of its place in `errors`."""
-    drawing.draw(np.random.default_rng(0), (1, 4), window, 0.0)
-    drawing.feedback(np.array([window]), np.array([errors]))
+    sampler.sample(np.random.default_rng(0), (1, 4), window, 0.0)
+    sampler.feedback(np.array([window]), np.array([errors]))
 
 
-def mass(drawing: Any, window: range) -> Any:
+def mass(sampler: Any, window: range) -> Any:
     """The share of each row of the window."""
-    values = drawing.sums.values[np.array(window) % drawing.sums.size]
+    values = sampler.tree.values[np.array(window) % sampler.tree.size]
     return values / values.sum()
 
 
@@ -50,7 +50,7 @@ def mass(drawing: Any, window: range) -> Any:
 
 def test_blocks_find_what_a_running_sum_finds(rng: np.random.Generator) -> None:
     """Whole numbers, whose sums are exact: ten thousand changes, with searchsorted as the judge."""
-    sums, plain = Sums(500), np.zeros(500)
+    sums, plain = SumTree(500), np.zeros(500)
     for _ in range(400):
         places, values = rng.integers(500, size=25), rng.integers(5, size=25).astype(float)
         sums.put(places, values)
@@ -61,7 +61,7 @@ def test_blocks_find_what_a_running_sum_finds(rng: np.random.Generator) -> None:
         found = np.cumsum(plain).searchsorted(wanted, side="right")
         np.testing.assert_array_equal(sums.find(wanted / total), found)
     np.testing.assert_array_equal(sums.values[:500], plain)
-    again = Sums(500)
+    again = SumTree(500)
     again.put(np.arange(500), plain)
     np.testing.assert_array_equal(again.sums, sums.sums)
 
@@ -69,17 +69,17 @@ def test_blocks_find_what_a_running_sum_finds(rng: np.random.Generator) -> None:
 def test_sums_do_not_depend_on_their_history(rng: np.random.Generator) -> None:
     """Bit for bit those of a fresh object, as a resumed run needs; also of one block."""
     for size in (7, 1000):
-        sums = Sums(size)
+        sums = SumTree(size)
         for _ in range(200):
             sums.put(rng.integers(size, size=9), rng.random(9) ** 7 * 1e6)
-        again = Sums(size)
+        again = SumTree(size)
         again.put(np.arange(size), sums.values[:size])
         np.testing.assert_array_equal(again.sums, sums.sums)
 
 
 def test_nothing_without_priority_is_found(rng: np.random.Generator) -> None:
     """Neither at the ends of [0, 1), nor where rounding carries past the last sum."""
-    sums, filled = Sums(1000), rng.choice(1000, 300, replace=False)
+    sums, filled = SumTree(1000), rng.choice(1000, 300, replace=False)
     sums.put(filled, rng.random(300) ** 9 + 1e-12)
     ends = np.cumsum(sums.values) / sums.values.sum()
     edges = np.concatenate([ends, np.nextafter(ends, 0), [0.0, np.nextafter(1.0, 0)]])
@@ -92,194 +92,194 @@ def test_nothing_without_priority_is_found(rng: np.random.Generator) -> None:
 
 def test_golden_shares_and_weights(rng: np.random.Generator) -> None:
     """Priorities 1 to 4, exponent .6, importance .4."""
-    drawing = per(4)
-    window = grow(drawing, 4)
-    tell(drawing, window, np.array([1, 2, 3, 4]) - 1e-6)
+    sampler = per(4)
+    window = grow(sampler, 4)
+    tell(sampler, window, np.array([1, 2, 3, 4]) - 1e-6)
     share = [0.148230, 0.224674, 0.286555, 0.340542]
-    np.testing.assert_allclose(mass(drawing, window), share, atol=1e-6)
-    numbers, weight = drawing.draw(rng, (3, 100), window, 0.0)
+    np.testing.assert_allclose(mass(sampler, window), share, atol=1e-6)
+    numbers, weight = sampler.sample(rng, (3, 100), window, 0.0)
     expected = np.array([1, 0.846745, 0.768229, 0.716978])
     np.testing.assert_allclose(weight, expected[numbers], atol=1e-6)
-    numbers, _ = drawing.draw(rng, (100_000, 1), window, 0.0)
+    numbers, _ = sampler.sample(rng, (100_000, 1), window, 0.0)
     expected = np.array(share) / sum(share) * 1e5
     assert stats.chisquare(np.bincount(numbers.ravel()), expected).pvalue > 1e-3
 
 
 def test_strata_share_a_minibatch_out(rng: np.random.Generator) -> None:
     """Of 1,000 draws each row has its share to within one on either side."""
-    drawing = per(4)
-    window = grow(drawing, 4)
-    tell(drawing, window, [1, 2, 3, 4])
-    numbers, _ = drawing.draw(rng, (1, 1000), window, 0.0)
+    sampler = per(4)
+    window = grow(sampler, 4)
+    tell(sampler, window, [1, 2, 3, 4])
+    numbers, _ = sampler.sample(rng, (1, 1000), window, 0.0)
     counts = np.bincount(numbers.ravel(), minlength=4)
-    assert np.abs(counts - 1000 * mass(drawing, window)).max() < 2
+    assert np.abs(counts - 1000 * mass(sampler, window)).max() < 2
 
 
 def test_weights_are_whole_at_the_end(rng: np.random.Generator) -> None:
     """With beta 1, share times weight is the same for all rows, so any weighted mean is unbiased;
     halfway beta is halfway.
     """
-    drawing = per(64)
-    window = grow(drawing, 64)
-    tell(drawing, window, rng.random(64) * 9)
-    share = mass(drawing, window)
-    numbers, weight = drawing.draw(rng, (2, 500), window, 1.0)
+    sampler = per(64)
+    window = grow(sampler, 64)
+    tell(sampler, window, rng.random(64) * 9)
+    share = mass(sampler, window)
+    numbers, weight = sampler.sample(rng, (2, 500), window, 1.0)
     assert weight.dtype == np.float32
     for row, product in zip(numbers, weight * share[numbers], strict=True):
         np.testing.assert_allclose(product, share[row].min(), rtol=1e-6)
-    numbers, weight = drawing.draw(rng, (1, 500), window, 0.5)
+    numbers, weight = sampler.sample(rng, (1, 500), window, 0.5)
     np.testing.assert_allclose(weight, (share[numbers].min() / share[numbers]) ** 0.7, rtol=1e-6)
 
 
 def test_lap_has_a_floor_and_no_weights(rng: np.random.Generator) -> None:
     """Priority max(error, 1) ** .4."""
-    drawing = choose(OffPolicy(replay="lap"), 4)
-    assert isinstance(drawing, ByError)
-    window = grow(drawing, 4)
-    tell(drawing, window, [0.0, 0.5, 1.0, 32.0])
-    np.testing.assert_allclose(drawing.sums.values[:4], [1, 1, 1, 4])
-    assert drawing.draw(rng, (2, 8), window, 0.5).weight is None
+    sampler = make_sampler(OffPolicy(replay="lap"), 4)
+    assert isinstance(sampler, ByError)
+    window = grow(sampler, 4)
+    tell(sampler, window, [0.0, 0.5, 1.0, 32.0])
+    np.testing.assert_allclose(sampler.tree.values[:4], [1, 1, 1, 4])
+    assert sampler.sample(rng, (2, 8), window, 0.5).weight is None
 
 
 def test_the_last_error_of_a_row_counts() -> None:
     """Within a minibatch, over the minibatches of a cycle, and over the members' cycles."""
-    drawing = per(8, exponent=1)
-    tell(drawing, grow(drawing, 8), [1.0] * 8)
-    drawing.feedback(np.array([[3, 3, 5], [5, 6, 7]]), np.array([[1, 2, 3], [4, 5, 6]], np.float32))
-    drawing.feedback(np.array([[7]]), np.array([[9]], np.float32))
+    sampler = per(8, exponent=1)
+    tell(sampler, grow(sampler, 8), [1.0] * 8)
+    sampler.feedback(np.array([[3, 3, 5], [5, 6, 7]]), np.array([[1, 2, 3], [4, 5, 6]], np.float32))
+    sampler.feedback(np.array([[7]]), np.array([[9]], np.float32))
     expected = np.array([1, 1, 1, 2, 1, 4, 5, 9]) + 1e-6
-    np.testing.assert_allclose(drawing.sums.values[:8], expected, rtol=1e-12)
+    np.testing.assert_allclose(sampler.tree.values[:8], expected, rtol=1e-12)
 
 
 def test_new_rows_take_the_largest_priority(rng: np.random.Generator) -> None:
     """At once, and the largest is measured anew after 250 updates."""
-    drawing = per(8, exponent=1)
-    window = grow(drawing, 4)
-    tell(drawing, window, [1e-3, 1e-3, 8.0, 1e-3])
-    assert drawing.largest == 8 + 1e-6
-    window = grow(drawing, 1)
-    numbers, _ = drawing.draw(rng, (1, 100), window, 0.0)
+    sampler = per(8, exponent=1)
+    window = grow(sampler, 4)
+    tell(sampler, window, [1e-3, 1e-3, 8.0, 1e-3])
+    assert sampler.largest == 8 + 1e-6
+    window = grow(sampler, 1)
+    numbers, _ = sampler.sample(rng, (1, 100), window, 0.0)
     assert 40 < (numbers == 4).sum() < 60
-    drawing.feedback(np.array([[2], [4]]), np.array([[0.5], [0.25]], np.float32))
-    assert drawing.largest == 8 + 1e-6
+    sampler.feedback(np.array([[2], [4]]), np.array([[0.5], [0.25]], np.float32))
+    assert sampler.largest == 8 + 1e-6
     one = np.array([[0]]), np.array([[0.125]], np.float32)
-    while drawing.updates < 250:
-        drawing.feedback(*one)
-    assert drawing.largest == 0.5 + 1e-6
+    while sampler.updates < 250:
+        sampler.feedback(*one)
+    assert sampler.largest == 0.5 + 1e-6
 
 
 def test_priorities_equal_a_plain_table_around_the_ring(rng: np.random.Generator) -> None:
     """Rows come, leave and are drawn; a dict of row numbers is the judge."""
-    drawing: Any = per(50)
+    sampler: Any = per(50)
     table: dict[int, float] = {}
     for _ in range(300):
-        head = drawing.known
+        head = sampler.known
         fresh = int(rng.integers(1, 9))
         for number in range(head, head + fresh):
-            table[number] = drawing.largest
-        window = grow(drawing, fresh)
+            table[number] = sampler.largest
+        window = grow(sampler, fresh)
         table = {n: value for n, value in table.items() if n in window}
-        numbers, _ = drawing.draw(rng, (2, 16), window, 0.0)
+        numbers, _ = sampler.sample(rng, (2, 16), window, 0.0)
         assert set(numbers.ravel()) <= set(window)
         error = rng.random((2, 16)).astype(np.float32) * 3
-        drawing.feedback(numbers, error)
+        sampler.feedback(numbers, error)
         for number, value in zip(numbers.ravel(), error.ravel(), strict=True):
             table[int(number)] = (float(value) + 1e-6) ** 0.6
         expected = np.array([table[n] for n in window])
-        found = drawing.sums.values[np.array(window) % 50]
+        found = sampler.tree.values[np.array(window) % 50]
         np.testing.assert_allclose(found, expected, rtol=1e-14)
-        np.testing.assert_allclose(drawing.sums.sums.sum(), expected.sum(), rtol=1e-12)
+        np.testing.assert_allclose(sampler.tree.sums.sum(), expected.sum(), rtol=1e-12)
 
 
 # By return.
 
 
-def episodes(drawing: ByReturn, returns: Any, length: int = 3, member: int = 0) -> range:
+def episodes(sampler: ByReturn, returns: Any, length: int = 3, member: int = 0) -> range:
     """Play episodes whose steps each pay their share; the window."""
     for total in returns:
         for step in range(length):
-            drawing.add(drawing.head, member, total * step / length)
-        drawing.end(member, total)
-    return range(max(0, drawing.head - drawing.size), drawing.head)
+            sampler.add(sampler.head, member, total * step / length)
+        sampler.end(member, total)
+    return range(max(0, sampler.head - sampler.size), sampler.head)
 
 
-def shares(drawing: ByReturn, window: range) -> Any:
+def shares(sampler: ByReturn, window: range) -> Any:
     """Priority of each row, without the normaliser."""
-    return drawing.priority(np.array(window)) * 1.05**drawing.exponent
+    return sampler.priority(np.array(window)) * 1.05**sampler.exponent
 
 
 def test_rows_rank_by_their_episodes_return() -> None:
     """(0.05 + (rank + 1/2) / n) ** .6, whatever the returns' scale and sign; ties share a rank."""
     expected = (0.05 + (np.array([2, 0, 1, 3]) + 0.5) / 4) ** 0.6
     for scale, shift in [(1, 0), (7, -1000), (0.01, 3)]:
-        drawing = ByReturn(100, 0.6, 0.0, to_go=False)
-        window = episodes(drawing, [scale * x + shift for x in (5, -7, 0, 900)])
-        np.testing.assert_allclose(shares(drawing, window), expected.repeat(3), rtol=1e-12)
-    drawing = ByReturn(100, 1.0, 0.0, to_go=False)
-    window = episodes(drawing, [4, 4, 1])
+        sampler = ByReturn(100, 0.6, 0.0, to_go=False)
+        window = episodes(sampler, [scale * x + shift for x in (5, -7, 0, 900)])
+        np.testing.assert_allclose(shares(sampler, window), expected.repeat(3), rtol=1e-12)
+    sampler = ByReturn(100, 1.0, 0.0, to_go=False)
+    window = episodes(sampler, [4, 4, 1])
     ranks = np.array([2, 2, 0.5]) / 3
-    np.testing.assert_allclose(shares(drawing, window), (0.05 + ranks).repeat(3), rtol=1e-12)
+    np.testing.assert_allclose(shares(sampler, window), (0.05 + ranks).repeat(3), rtol=1e-12)
 
 
 def test_running_episodes_are_in_the_middle_and_members_apart() -> None:
     """Two members' rows in turn; whose episode ended takes its rank, the other's waits."""
-    drawing = ByReturn(100, 1.0, 0.0, to_go=False)
-    episodes(drawing, [10])
+    sampler = ByReturn(100, 1.0, 0.0, to_go=False)
+    episodes(sampler, [10])
     for _ in range(3):
-        drawing.add(drawing.head, 0, 0.0)
-        drawing.add(drawing.head, 1, 0.0)
-    drawing.end(1, 20.0)
+        sampler.add(sampler.head, 0, 0.0)
+        sampler.add(sampler.head, 1, 0.0)
+    sampler.end(1, 20.0)
     window = range(3, 9)
-    np.testing.assert_allclose(shares(drawing, window), np.tile([0.55, 0.8], 3))
-    np.testing.assert_allclose(shares(drawing, range(3)), 0.3)
-    drawing.end(0, None)  # broke off: it keeps the middle, and the next episode starts afresh
-    drawing.add(drawing.head, 0, 0.0)
-    drawing.end(0, 30.0)
+    np.testing.assert_allclose(shares(sampler, window), np.tile([0.55, 0.8], 3))
+    np.testing.assert_allclose(shares(sampler, range(3)), 0.3)
+    sampler.end(0, None)  # broke off: it keeps the middle, and the next episode starts afresh
+    sampler.add(sampler.head, 0, 0.0)
+    sampler.end(0, 30.0)
     ranks = [1 / 6] * 3 + [1 / 2] * 6 + [5 / 6]
-    np.testing.assert_allclose(shares(drawing, range(10)) - 0.05, ranks)
+    np.testing.assert_allclose(shares(sampler, range(10)) - 0.05, ranks)
 
 
 def test_return_to_go_ranks_each_row() -> None:
     """Rewards 1, 2, 3 and 5, -5, 4: to go 6, 5, 3 and 4, -1, 4."""
-    drawing = ByReturn(100, 1.0, 0.0, to_go=True)
+    sampler = ByReturn(100, 1.0, 0.0, to_go=True)
     for rewards in ([1, 2, 3], [5, -5, 4]):
         for step, earned in enumerate(np.cumsum([0, *rewards[:-1]])):
-            drawing.add(drawing.head, 0, float(earned))
+            sampler.add(sampler.head, 0, float(earned))
             assert step < 3
-        drawing.end(0, float(sum(rewards)))
+        sampler.end(0, float(sum(rewards)))
     ranks = (stats.rankdata([6, 5, 3, 4, -1, 4]) - 0.5) / 6
-    np.testing.assert_allclose(shares(drawing, range(6)), 0.05 + ranks)
+    np.testing.assert_allclose(shares(sampler, range(6)), 0.05 + ranks)
 
 
 def test_return_to_go_among_many_rows(rng: np.random.Generator) -> None:
     """Beyond 4,096 rows they are ranked among a part of them, to within a few hundredths."""
-    drawing = ByReturn(20_000, 1.0, 0.0, to_go=True)
-    window = episodes(drawing, rng.normal(size=200) * 50, length=130)
-    assert len(drawing.ranking) <= 4096
-    scores = drawing.scores[np.array(window) % 20_000]
+    sampler = ByReturn(20_000, 1.0, 0.0, to_go=True)
+    window = episodes(sampler, rng.normal(size=200) * 50, length=130)
+    assert len(sampler.ranking) <= 4096
+    scores = sampler.scores[np.array(window) % 20_000]
     exact = (stats.rankdata(scores) - 0.5) / len(scores)
-    np.testing.assert_allclose(shares(drawing, window), 0.05 + exact, atol=0.03)
+    np.testing.assert_allclose(shares(sampler, window), 0.05 + exact, atol=0.03)
 
 
 def test_what_left_the_window_has_no_rank(rng: np.random.Generator) -> None:
     """Seven rows are left: of episode 30 one, of 20 and 10 all; 40 counts no more."""
-    drawing = ByReturn(7, 1.0, 0.0, to_go=False)
-    window = episodes(drawing, [40, 30, 20, 10])
+    sampler = ByReturn(7, 1.0, 0.0, to_go=False)
+    window = episodes(sampler, [40, 30, 20, 10])
     assert window == range(5, 12)
-    np.testing.assert_allclose(shares(drawing, window) - 0.05, np.array([5, 3, 3, 3, 1, 1, 1]) / 6)
-    numbers, _ = drawing.draw(rng, (100, 100), window, 0.0)
+    np.testing.assert_allclose(shares(sampler, window) - 0.05, np.array([5, 3, 3, 3, 1, 1, 1]) / 6)
+    numbers, _ = sampler.sample(rng, (100, 100), window, 0.0)
     assert set(numbers.ravel()) == set(window)
 
 
 @pytest.mark.parametrize("to_go", [False, True])
 def test_rows_are_drawn_by_rank(to_go: bool, rng: np.random.Generator) -> None:
     """Chi-square of 100,000 draws, after the ring has gone round; weights undo the shares."""
-    drawing = ByReturn(40, 2.0, 0.5, to_go)
-    window = episodes(drawing, rng.normal(size=30), length=5)
-    drawing.add(drawing.head, 0, 0.0)
+    sampler = ByReturn(40, 2.0, 0.5, to_go)
+    window = episodes(sampler, rng.normal(size=30), length=5)
+    sampler.add(sampler.head, 0, 0.0)
     window = range(window.start + 1, window.stop + 1)
-    share = shares(drawing, window)
-    numbers, weight = drawing.draw(rng, (2, 50_000), window, 1.0)
+    share = shares(sampler, window)
+    numbers, weight = sampler.sample(rng, (2, 50_000), window, 1.0)
     counts = np.bincount(numbers.ravel() - window.start)
     assert stats.chisquare(counts, share / share.sum() * 1e5).pvalue > 1e-3
     product = weight * share[numbers - window.start]
@@ -292,23 +292,23 @@ def test_rows_are_drawn_by_rank(to_go: bool, rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_exponent_zero_is_uniform(kind: str, rng: np.random.Generator) -> None:
     """Every row has the same share and weight 1; by return even the first draw is the same."""
-    drawing: Any = choose(OffPolicy(replay=kind, replay_exponent=0), 60)
+    sampler: Any = make_sampler(OffPolicy(replay=kind, replay_exponent=0), 60)
     window = range(20, 80)
     for number in range(80):
-        drawing.add(number, 0, 0.0)
+        sampler.add(number, 0, 0.0)
         if number % 7 == 6:
-            drawing.end(0, float(number))
-    drawing.draw(rng, (2, 5), window, 0.0)
-    drawing.feedback(np.array([window]), rng.random((1, 60)).astype(np.float32))
-    numbers, weight = drawing.draw(rng, (60_000, 1), window, 0.5)
+            sampler.end(0, float(number))
+    sampler.sample(rng, (2, 5), window, 0.0)
+    sampler.feedback(np.array([window]), rng.random((1, 60)).astype(np.float32))
+    numbers, weight = sampler.sample(rng, (60_000, 1), window, 0.5)
     assert stats.chisquare(np.bincount(numbers.ravel() - 20)).pvalue > 1e-3
     assert weight is None or np.all(weight == 1)
     if kind == "return":
         first, again = np.random.default_rng(3), np.random.default_rng(3)
-        uniform = Uniform().draw(first, (2, 50), window, 0.0).numbers
-        np.testing.assert_array_equal(drawing.draw(again, (2, 50), window, 0.0).numbers, uniform)
+        uniform = Uniform().sample(first, (2, 50), window, 0.0).numbers
+        np.testing.assert_array_equal(sampler.sample(again, (2, 50), window, 0.0).numbers, uniform)
     else:
-        assert np.all(mass(drawing, window) == 1 / 60)
+        assert np.all(mass(sampler, window) == 1 / 60)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "to-go"])
@@ -321,16 +321,18 @@ def test_replay_draws_only_its_window_and_goes_on_after_a_stop(
     hyper = OffPolicy(replay="return" if to_go else kind, replay_to_go=to_go)  # type: ignore[arg-type]
     mask = np.zeros(0, np.float32)
     replays = [
-        Replay(tmp_path / f"{i}.bin", Columns(1, 1), 50, 10_000, choose(hyper, 50)) for i in (0, 1)
+        Replay(tmp_path / f"{i}.bin", Layout(Spec(1, 1)), 50, 10_000, make_sampler(hyper, 50))
+        for i in (0, 1)
     ]
 
     def fill(replay: Replay, count: int) -> None:
         for _ in range(count):
             x = np.full(1, replay.head, np.float32)
             k = replay.head % 3 // 2
-            replay.add(x, x, 1.0, x, 0.9, False, mask, earned=float(replay.head % 5), member=k)
+            earned = float(replay.head % 5)
+            replay.add(Transition(x, x, 1.0, x, 0.9, False, mask, earned), k)
             if replay.head % 11 == 0:
-                replay.drawing.end(k, float(replay.head % 13))
+                replay.sampler.end(k, float(replay.head % 13))
 
     def cycle(replay: Replay, stream: np.random.Generator) -> Any:
         sample = replay.sample(stream, (2, 32), 0.25)
@@ -346,7 +348,7 @@ def test_replay_draws_only_its_window_and_goes_on_after_a_stop(
     fill(first, 3)
     fill(second, first.head)  # the rows alone are in the file
     table, arrays = second.commit(), {key: x.copy() for key, x in first.arrays().items()}
-    second.drawing = choose(hyper, 50)
+    second.sampler = make_sampler(hyper, 50)
     second.restore(table, arrays)
     one, other = np.random.default_rng(5), np.random.default_rng(5)
     for _ in range(70):
@@ -362,23 +364,23 @@ def test_replay_draws_only_its_window_and_goes_on_after_a_stop(
 
 
 def test_cycles_of_all_members_are_drawn_before_any_error_returns(runs: Path) -> None:
-    """One replay for both: draw, draw, feedback, feedback."""
+    """One replay for both: sample, sample, feedback, feedback."""
     settings: dict[str, Any] = {**TINY, "warmup": 20, "steps": 60, "replay": "prioritized"}
     trainer = Trainer("multi-td3", CORRIDOR, runs=runs, env_kwargs={"cut_at": 10}, **settings)
-    drawing, calls = trainer.ensemble.replays[0].drawing, list[str]()
-    draw, feedback = drawing.draw, drawing.feedback
+    sampler, calls = trainer.loop.replays[0].sampler, list[str]()
+    sample, feedback = sampler.sample, sampler.feedback
 
-    def watched_draw(*words: Any) -> Any:
-        calls.append("draw")
-        return draw(*words)
+    def watched_sample(*words: Any) -> Any:
+        calls.append("sample")
+        return sample(*words)
 
     def watched_feedback(*words: Any) -> None:
         calls.append("feedback")
         feedback(*words)
 
-    drawing.draw, drawing.feedback = watched_draw, watched_feedback  # type: ignore[method-assign]
+    sampler.sample, sampler.feedback = watched_sample, watched_feedback  # type: ignore[method-assign]
     run_to_end(trainer)
-    assert calls == ["draw", "draw", "feedback", "feedback"] * (len(calls) // 4)
+    assert calls == ["sample", "sample", "feedback", "feedback"] * (len(calls) // 4)
     assert len(calls) == 40
 
 
@@ -390,7 +392,7 @@ def test_horizon_is_set_at_the_start(runs: Path) -> None:
     trainer = Trainer.resume(trainer.directory.path, steps=400)
     assert trainer.directory.settings()["replay_horizon"] == 200
     seen: list[float] = []
-    replay = trainer.ensemble.replays[0]
+    replay = trainer.loop.replays[0]
     sample = replay.sample
 
     def watched(rng: Any, shape: Any, done: float) -> Any:

@@ -1,0 +1,106 @@
+"""One env, the episode that runs in it, and the noise of whoever explores it."""
+
+from typing import Any
+
+import numpy as np
+
+from pacesetter.algorithms.contract import Learner
+from pacesetter.batch import Transition
+from pacesetter.envs import Environment, Snapshot
+from pacesetter.errors import TrainingError
+from pacesetter.learner.tree_arrays import flatten, rebuild
+from pacesetter.policy import clip
+from pacesetter.seeding import Stream, generator
+from pacesetter.types import Arrays, Floats
+
+
+class Explorer:
+    """Acts in one env; the learner's parameters are handed to it at every step."""
+
+    def __init__(
+        self, learner: Learner, env: Environment, params: Any, seed: int, index: int
+    ) -> None:
+        self.learner, self.env = learner, env
+        streams = (Stream.WARMUP, Stream.ACT, Stream.MASK)
+        self.streams = [generator(seed, stream, index) for stream in streams]
+        self.warmup_stream, self.act_stream, self.mask_stream = self.streams
+        # Only its shape counts before the first episode, so its stream is not used yet.
+        self.noise_state = learner.start_episode(params, generator(seed, Stream.ACT))
+        self.starting = True  # the next tick begins an episode
+        self.active = True  # False while it waits for other members to end their episodes
+        self.started = 0  # step of the run at which the episode began
+
+    def start(self, params: Any, step: int) -> None:
+        """Begin an episode at a step of the run."""
+        self.env.reset()
+        self.starting, self.active, self.started = False, True, step
+        self.noise_state = self.learner.start_episode(params, self.act_stream)
+
+    def random_action(self) -> Floats:
+        """A uniform action of the warm-up."""
+        return self.warmup_stream.uniform(-1, 1, self.env.action_size).astype(np.float32)
+
+    def act(self, params: Any, observation: Floats) -> Floats:
+        """The learner's exploring action for a normalised observation."""
+        action, self.noise_state = self.learner.act(
+            params, self.noise_state, observation, self.act_stream
+        )
+        return action
+
+    def step(self, action: Floats, gamma: float, clipped: bool) -> Transition:
+        """Step the env with the clipped action; the transition holds it clipped or as it is."""
+        if not np.isfinite(action).all():
+            raise TrainingError(f"action is not finite: {action}")
+        env, sent = self.env, clip(action)
+        before, earned = env.observation, env.earned
+        step = env.step(sent)
+        self.active = not step.ended
+        return Transition(
+            observation=before,
+            action=sent if clipped else action,
+            reward=step.reward,
+            next_observation=step.observation,
+            discount=gamma * (1.0 - step.terminated),
+            last=step.ended,
+            mask=self.learner.mask(self.mask_stream),
+            earned=earned,
+        )
+
+    @property
+    def _running(self) -> bool:
+        return self.active and not self.starting
+
+    def arrays(self) -> Arrays:
+        """The noise state and the running episode; of one that is over, only its number counts."""
+        _, actions, observation = self.env.snapshot()
+        if not self._running:
+            actions, observation = actions[:0], np.zeros_like(observation)
+        noise = flatten({"noise_state": self.noise_state})
+        return {"actions": actions, "observation": observation, **noise}
+
+    def table(self) -> dict[str, Any]:
+        return {
+            "streams": [stream.bit_generator.state for stream in self.streams],
+            "episode": self.env.episode,
+            "earned": self.env.earned if self._running else 0.0,
+            "starting": self.starting,
+            "active": self.active,
+            "started": self.started,
+        }
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> str | None:
+        """The inverse of `arrays` and `table`; a note if the env does not repeat the running
+        episode exactly, so that another one begins.
+        """
+        for stream, state in zip(self.streams, table["streams"], strict=True):
+            stream.bit_generator.state = state
+        self.noise_state = rebuild({"noise_state": self.noise_state}, arrays)["noise_state"]
+        self.starting, self.active = table["starting"], table["active"]
+        self.started = table["started"]
+        snapshot = Snapshot(table["episode"], arrays["actions"], arrays["observation"])
+        if not self._running:
+            self.env.episode = snapshot.episode
+        elif not (self.env.restore(snapshot) and self.env.earned == table["earned"]):
+            self.starting = True
+            return f"{self.env.name} does not repeat an episode exactly; a new one starts"
+        return None

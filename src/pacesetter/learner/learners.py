@@ -1,0 +1,68 @@
+"""The states of K learners of one compiled program, and their updates at the same time."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pacesetter.algorithms.contract import State
+from pacesetter.envs import Environment
+from pacesetter.learner.compiled import CompiledLearner, MemberUpdate
+from pacesetter.learner.normalizer import Statistics
+from pacesetter.learner.tree_arrays import flatten, rebuild
+from pacesetter.policy import Policy
+from pacesetter.process import threads
+from pacesetter.seeding import Stream, generator
+from pacesetter.types import Arrays
+
+
+class Learners:
+    """K states, what each acts with, and the stream that chooses each one's minibatches."""
+
+    def __init__(
+        self, compiled: CompiledLearner, members: int, seed: int, same: bool = False
+    ) -> None:
+        """`same` gives every member the same first weights."""
+        self.compiled = compiled
+        self.replace(compiled.init(members, same))
+        self.sample_streams = [generator(seed, Stream.SAMPLE, k) for k in range(members)]
+        self.workers = ThreadPoolExecutor(min(members, threads()))
+
+    def replace(self, states: list[State]) -> None:
+        """Go on from other states."""
+        self.states = states
+        self.policy_params = self.compiled.policy_params(states)
+
+    def update(self, members: Sequence[int], inputs: Sequence[Any]) -> list[MemberUpdate]:
+        """One call of the update of each of these members; inputs are those of `compiled.update`
+        after the member.
+        """
+
+        def one(k: int, given: Any) -> MemberUpdate:
+            return self.compiled.update(self.states[k], k, *given)
+
+        run = map if len(members) == 1 else self.workers.map
+        results = list(run(one, members, inputs))
+        for k, result in zip(members, results, strict=True):
+            self.states[k] = result.state
+            self.policy_params[k] = jax.tree.map(np.asarray, result.policy_params)
+        return results
+
+    def policy(self, member: int, env: Environment, statistics: Statistics) -> Policy:
+        """A member's policy as it is now, for an env like this one."""
+        return self.compiled.policy(self.states[member], env, statistics)
+
+    def arrays(self) -> Arrays:
+        return flatten(self.states)
+
+    def table(self) -> dict[str, Any]:
+        return {"sample_streams": [rng.bit_generator.state for rng in self.sample_streams]}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
+        """The inverse of `arrays` and `table`."""
+        self.replace(jax.tree.map(jnp.array, rebuild(self.states, arrays)))
+        for rng, state in zip(self.sample_streams, table["sample_streams"], strict=True):
+            rng.bit_generator.state = state
