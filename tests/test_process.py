@@ -8,7 +8,7 @@ import pytest
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.process import cores, fix_threads, threads
-from pacesetter.provenance import provenance
+from pacesetter.runs.provenance import provenance
 
 
 @pytest.mark.parametrize("text", ["x", "0", "-1", "1.5", "2 3", "1e3"])

@@ -5,10 +5,10 @@ from typing import Any
 
 from tabulate import tabulate
 
-from pacesetter.budget import budget, is_spent
 from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, RunDirectory, find, find_all
+from pacesetter.runs.budget import budget, is_spent
 
 SHOWN_EVALUATIONS = 5
 

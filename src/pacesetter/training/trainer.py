@@ -7,7 +7,6 @@ from typing import Any, Self
 
 import jax
 
-from pacesetter.budget import out_of_time
 from pacesetter.config import read_file, resolve
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
@@ -17,8 +16,9 @@ from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
-from pacesetter.provenance import versions
 from pacesetter.runs import RunDirectory, find
+from pacesetter.runs.budget import out_of_time
+from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.training import checkpoint

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 from pacesetter import storage
-from pacesetter.budget import is_spent
 from pacesetter.ensemble.progress import Progress
 from pacesetter.errors import UsageError
 from pacesetter.runs import IN_USE
+from pacesetter.runs.budget import is_spent
 from pacesetter.study.bench.suite import Job
 
 RETRIES = 2

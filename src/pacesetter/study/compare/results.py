@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pacesetter.budget import budget, is_spent, steps_per_count
 from pacesetter.errors import UsageError
 from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all
+from pacesetter.runs.budget import budget, is_spent, steps_per_count
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.stats import Array
 

@@ -15,7 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from pacesetter.errors import UsageError
-from pacesetter.provenance import versions
+from pacesetter.runs.provenance import versions
 from pacesetter.study.compare import lineage
 from pacesetter.study.compare.comparison import Comparison
 from pacesetter.study.compare.results import AXES, Run

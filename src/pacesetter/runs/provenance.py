@@ -34,7 +34,7 @@ def versions() -> dict[str, str]:
 
 
 def _commit() -> str | None:
-    checkout = Path(__file__).parents[2]
+    checkout = Path(__file__).parents[3]
     if not (checkout / ".git").exists() or not (git := shutil.which("git")):
         return None
     describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]

@@ -13,7 +13,7 @@ from typing import Any
 
 from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
-from pacesetter.provenance import provenance
+from pacesetter.runs.provenance import provenance
 from pacesetter.storage import TEMPORARY, write_atomically
 from pacesetter.validation import difference
 
