@@ -2,8 +2,8 @@
 
 import pytest
 
-from pacesetter import budget
 from pacesetter.config import resolve
+from pacesetter.settings import budget
 
 
 @pytest.mark.parametrize(("count", "steps"), [("all", 900), ("member", 2700)])

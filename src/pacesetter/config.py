@@ -11,11 +11,20 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from pacesetter import algorithms, budget
+from pacesetter import algorithms
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import UsageError, unknown
-from pacesetter.settings import ROWS_A_TICK, STRICT, Count, Duration, OffPolicy, OnPolicy, Settings
-from pacesetter.validation import build, fields_of
+from pacesetter.settings import (
+    ROWS_A_TICK,
+    STRICT,
+    Count,
+    Duration,
+    OffPolicy,
+    OnPolicy,
+    Settings,
+    budget,
+)
+from pacesetter.settings.validation import build, fields_of
 
 
 def _check_rule(value: str) -> str:

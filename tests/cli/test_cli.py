@@ -25,8 +25,8 @@ from pacesetter.config import Run, resolve
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.runs import RunDirectory, find
+from pacesetter.settings.validation import fields_of
 from pacesetter.training.trainer import Trainer
-from pacesetter.validation import fields_of
 
 PROBE = "broken_envs:Probe-v0"
 SMALL = [

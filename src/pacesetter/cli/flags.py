@@ -7,7 +7,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
-from pacesetter.validation import fields_of
+from pacesetter.settings.validation import fields_of
 
 _POSITIONAL = {"algorithm", "env", "env_kwargs"}
 _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}

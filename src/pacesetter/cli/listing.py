@@ -8,7 +8,7 @@ from tabulate import tabulate
 from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, RunDirectory, find, find_all
-from pacesetter.runs.budget import budget, is_spent
+from pacesetter.settings.budget import budget, is_spent
 
 SHOWN_EVALUATIONS = 5
 

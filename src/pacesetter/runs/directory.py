@@ -15,7 +15,7 @@ from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs.provenance import provenance
 from pacesetter.storage import TEMPORARY, write_atomically
-from pacesetter.validation import difference
+from pacesetter.settings.validation import difference
 
 SCHEMA = 1
 IN_USE = "is in use by"

@@ -17,10 +17,10 @@ from pacesetter.evaluation import Evaluation, rollouts
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
-from pacesetter.runs.budget import out_of_time
 from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
+from pacesetter.settings.budget import out_of_time
 from pacesetter.training import checkpoint
 from pacesetter.training.on_policy import OnPolicyLoop
 

@@ -14,7 +14,7 @@ from pacesetter import storage
 from pacesetter.ensemble.progress import Progress
 from pacesetter.errors import UsageError
 from pacesetter.runs import IN_USE
-from pacesetter.runs.budget import is_spent
+from pacesetter.settings.budget import is_spent
 from pacesetter.study.bench.suite import Job
 
 RETRIES = 2

@@ -16,10 +16,10 @@ from pydantic.dataclasses import dataclass as checked
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import FREE_PER_SEED
 from pacesetter.settings import STRICT, Count, Duration
+from pacesetter.settings.validation import build
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.results import Run, gather
 from pacesetter.study.compare.stats import Array
-from pacesetter.validation import build
 
 METRICS = {
     "final": "mean of the evaluations in the last 10% of the budget, and of at least three",

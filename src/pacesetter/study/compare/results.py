@@ -12,7 +12,7 @@ import numpy as np
 
 from pacesetter.errors import UsageError
 from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all
-from pacesetter.runs.budget import budget, is_spent, steps_per_count
+from pacesetter.settings.budget import budget, is_spent, steps_per_count
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.stats import Array
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.settings import Settings, Tune
-from pacesetter.validation import difference, fields_of
+from pacesetter.settings.validation import difference, fields_of
 
 try:
     import optuna
