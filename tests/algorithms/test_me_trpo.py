@@ -444,7 +444,7 @@ def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
         told = trainer.loop.training_values()
         searched += told["policy_updates"]
         fitted += told["model_epochs"]
-    found = trainer.loop.ledger()
+    found = trainer.ledger()
     trainer.close()
     assert found["updates"] == 3
     assert found["resets"] == 3 * SMALL["starts"]

@@ -78,7 +78,7 @@ def test_rows_are_the_definition_for_members_in_turn(n: int, rng: np.random.Gene
         found[k] += queues[k].push(steps[k].pop(0))
         if rng.random() < 0.3:
             again = NStepQueue(n)
-            again.restore(queues[k].arrays())
+            again.restore({}, queues[k].arrays())
             queues[k] = again
     for k in range(3):
         assert not queues[k].rows

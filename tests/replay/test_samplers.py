@@ -12,7 +12,7 @@ from pacesetter.batch import Layout, Spec, Transition
 from pacesetter.replay.buffer import Replay, make_sampler
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError, SumTree
-from pacesetter.replay.sampler import Uniform
+from pacesetter.replay.sampler import Sampler
 from pacesetter.settings import OffPolicy
 from pacesetter.training.trainer import Trainer
 
@@ -305,7 +305,7 @@ def test_exponent_zero_is_uniform(kind: str, rng: np.random.Generator) -> None:
     assert weight is None or np.all(weight == 1)
     if kind == "return":
         first, again = np.random.default_rng(3), np.random.default_rng(3)
-        uniform = Uniform().sample(first, (2, 50), window, 0.0).numbers
+        uniform = Sampler().sample(first, (2, 50), window, 0.0).numbers
         np.testing.assert_array_equal(sampler.sample(again, (2, 50), window, 0.0).numbers, uniform)
     else:
         assert np.all(mass(sampler, window) == 1 / 60)

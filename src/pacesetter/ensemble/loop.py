@@ -6,6 +6,7 @@ from typing import Any, Protocol
 
 from pacesetter.ensemble.progress import Progress
 from pacesetter.ensemble.selection import Selection
+from pacesetter.learner.learners import Learners
 from pacesetter.policy import Policy
 from pacesetter.replay.buffer import Replay
 from pacesetter.types import Arrays
@@ -27,6 +28,7 @@ class Loop(Protocol):
     """Everything that a run trains and trains on."""
 
     progress: Progress
+    learners: Learners
     budget: int  # env steps in all, of every member and, where it is counted, of selection
 
     @property
@@ -47,10 +49,6 @@ class Loop(Protocol):
 
     def policy(self, member: int) -> Policy:
         """What a member is evaluated by."""
-        ...
-
-    def ledger(self) -> dict[str, Any]:
-        """What the run has spent."""
         ...
 
     def training_values(self) -> dict[str, Any]:

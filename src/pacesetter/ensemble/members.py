@@ -5,7 +5,6 @@ members that have updates due make them on their own minibatches        learn
 when the round is over, all start again from what the rule chose        end_round
 """
 
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -85,23 +84,9 @@ class Members:
         for replay in self.replays:
             replay.close()
 
-    @cached_property
-    def loss_names(self) -> list[str]:
-        """Names of the losses, in the order of their columns."""
-        return self.learners.compiled.loss_names(self.learners.states[0])
-
-    def ledger(self) -> dict[str, Any]:
-        """What the run has spent."""
-        progress = self.progress
-        actions = sum(member.actions for member in progress.members)
-        learners = self.learners
-        extra = learners.compiled.learner.ledger(learners.states, progress.updates, actions)
-        return progress.ledger() | extra
-
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""
-        values = self.progress.training_values(self.loss_names)
-        return values | self.policy_checkpoints.training_values()
+        return self.progress.training_values() | self.policy_checkpoints.training_values()
 
     def policy(self, member: int) -> Policy:
         """A member's policy: the best that was kept, if any was, or as it is now."""
@@ -193,11 +178,14 @@ class Members:
 
     def _update(self, members: list[int]) -> None:
         """One call of the update of each of these members, all at the same time."""
-        samples = [self._sample(k) for k in members]
-        inputs = [self._inputs(k, sample) for k, sample in zip(members, samples, strict=True)]
+        statistics, samples = self.normalizer.statistics(), [self._sample(k) for k in members]
+        inputs: list[Any] = []
+        for k, sample in zip(members, samples, strict=True):
+            call, scales = self.progress.members[k].update_calls, self.progress.members[k].scales
+            inputs.append((call, sample.rows, sample.weight, statistics, None, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):
-            self.progress.add_losses(self.loss_names, result.losses, f"member {k}, ")
+            self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
             self.replay(k).feedback(sample.numbers, np.asarray(result.td_error))
             self.progress.members[k].update_calls += 1
 
@@ -211,10 +199,6 @@ class Members:
         done = min(progress.step / horizon, 1.0) if horizon else 1.0
         shape = (updates, hyper.batch_size)
         return self.replay(k).sample(self.learners.sample_streams[k], shape, done)
-
-    def _inputs(self, k: int, sample: Sample) -> Any:
-        member, statistics = self.progress.members[k], self.normalizer.statistics()
-        return member.update_calls, sample.rows, sample.weight, statistics, None, member.scales
 
     # End a round.
 

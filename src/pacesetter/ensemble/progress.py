@@ -42,7 +42,7 @@ class Progress:
     next_train: int = TRAIN_ROW_EVERY
     best: float | None = None
     ended: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
-    losses: list[float] = field(default_factory=list[float])  # sums since the last row
+    losses: dict[str, float] = field(default_factory=dict[str, float])  # sums since the last row
     summed: int = 0  # how many losses were summed
     wall_seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -65,6 +65,11 @@ class Progress:
 
     def arrays(self) -> Arrays:
         return {}
+
+    @property
+    def actions(self) -> int:
+        """Steps whose action a learner chose."""
+        return sum([member.actions for member in self.members])
 
     def table(self) -> dict[str, Any]:
         return asdict(self)
@@ -90,20 +95,17 @@ class Progress:
 
     def add_losses(self, names: Sequence[str], losses: Floats, who: str = "") -> None:
         """Add the losses of one update to what the next row averages, if all are finite."""
-        values: list[float] = losses.tolist()
-        for name, loss in zip(names, values, strict=True):
+        for name, loss in zip(names, losses.tolist(), strict=True):
             if not isfinite(loss):
                 raise TrainingError(f"{who}step {self.step}: {name} is {loss}")
-        before = self.losses or [0.0] * len(values)
-        self.losses = [a + b for a, b in zip(before, values, strict=True)]
+            self.losses[name] = self.losses.get(name, 0.0) + loss
         self.summed += 1
 
-    def training_values(self, loss_names: Sequence[str]) -> dict[str, Any]:
+    def training_values(self) -> dict[str, Any]:
         """Episodes ended as [member, return, length] and mean losses, since the last row."""
-        means = [total / self.summed for total in self.losses]
         values: dict[str, Any] = {"episodes_ended": self.ended}
-        values |= dict(zip(loss_names, means, strict=False))  # no losses before the first update
-        self.ended, self.losses, self.summed = [], [], 0
+        values |= {name: total / self.summed for name, total in self.losses.items()}
+        self.ended, self.losses, self.summed = [], {}, 0
         return values
 
     def ledger(self) -> dict[str, Any]:

@@ -96,17 +96,12 @@ class CompiledLearner:
             state, np.asarray(losses), td_error, params
         )  # NumPy waits for the result
 
-    def loss_names(
-        self, state: State, rows: Floats | None = None, extra: dict[str, Any] | None = None
-    ) -> list[str]:
-        """Names of the columns of losses, in order; of rows only the shape matters."""
-        if rows is None:
-            rows = np.zeros((self.learner.updates_per_call, 1, self.layout.width), np.float32)
-        size = self.layout.spec.observation_size
-        statistics = (np.zeros(size), np.ones(size))
+    def loss_names(self, state: State, call: int, *inputs: Any) -> list[str]:
+        """Names of the losses, in order, for the inputs of an update; only their shapes matter."""
+        rows, weight, statistics, extra, *_ = *inputs, None
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
-            batch = self._batch(rows, None, statistics)._replace(**extra)
+            batch = self._batch(rows, weight, statistics)._replace(**extra)
             return self.learner.update(state, batch, self.key).losses
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))

@@ -27,6 +27,7 @@ class Learners:
     ) -> None:
         """`same` gives every member the same first weights."""
         self.compiled = compiled
+        self.loss_names: list[str] = []  # in the order of losses, known from the first update on
         self.replace(compiled.init(members, same))
         self.sample_streams = [generator(seed, Stream.SAMPLE, k) for k in range(members)]
         self.workers = ThreadPoolExecutor(min(members, threads()))
@@ -40,6 +41,8 @@ class Learners:
         """One call of the update of each of these members; inputs are those of `compiled.update`
         after the member.
         """
+        if not self.loss_names:
+            self.loss_names = self.compiled.loss_names(self.states[members[0]], *inputs[0])
 
         def one(k: int, given: Any) -> MemberUpdate:
             return self.compiled.update(self.states[k], k, *given)
@@ -54,6 +57,10 @@ class Learners:
     def policy(self, member: int, env: Environment, statistics: Statistics) -> Policy:
         """A member's policy as it is now, for an env like this one."""
         return self.compiled.policy(self.states[member], env, statistics)
+
+    def ledger(self, updates: int, actions: int) -> dict[str, int]:
+        """What so many updates and actions cost besides the members' own."""
+        return self.compiled.learner.ledger(self.states, updates, actions)
 
     def arrays(self) -> Arrays:
         return flatten(self.states)

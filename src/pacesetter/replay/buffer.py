@@ -15,7 +15,7 @@ from pacesetter.batch import Layout, Transition
 from pacesetter.errors import UsageError
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError
-from pacesetter.replay.sampler import Sampler, Uniform
+from pacesetter.replay.sampler import Sampler
 from pacesetter.storage import digest
 from pacesetter.types import Arrays, Floats, Numbers
 
@@ -48,7 +48,7 @@ class Replay:
         """`budget` is how many rows the whole run adds at most, `rows_per_tick` one tick."""
         self.rows_per_tick = MAX_ROWS_PER_TICK if rows_per_tick is None else rows_per_tick
         self.path, self.layout, self.capacity = path, layout, capacity
-        self.sampler = sampler or Uniform()
+        self.sampler = sampler or Sampler()
         self.slots = capacity + SLACK
         self.head = 0  # rows added so far
         self.committed = 0  # rows that the latest checkpoint covers
@@ -152,7 +152,7 @@ def make_sampler(hyper: Any, size: int) -> Sampler:
     """The sampler that settings ask for, of a replay with at most `size` rows."""
     exponent, importance = hyper.exponents
     if hyper.replay == "uniform":
-        return Uniform()
+        return Sampler()
     if hyper.replay == "return":
         return ByReturn(size, exponent, importance, hyper.replay_to_go)
     return ByError(size, exponent, importance, MEASURES[hyper.replay])

@@ -4,15 +4,15 @@ from collections import deque
 
 import numpy as np
 
-from pacesetter.replay.sampler import SampledIndices, importance_weights
-from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
+from pacesetter.replay.sampler import SampledIndices, Sampler, importance_weights
+from pacesetter.types import Arrays, Numbers, Reals, Shape
 
 FLOOR = 0.05  # added to a rank, so that no row is lost
 MIDDLE = 0.5  # rank of what has none yet
 REFERENCE = 4096  # rows that returns-to-go are ranked among
 
 
-class ByReturn:
+class ByReturn(Sampler):
     """Samples episodes with high returns more often: the future work of the Multi-TD3 paper.
 
     An episode's rank u in (0, 1) is that of its return among the finished episodes in the window;
@@ -73,8 +73,6 @@ class ByReturn:
         rank = (below + above) / max(2 * len(self.ranking), 1)
         rank = np.where(np.isnan(scores), MIDDLE, rank)
         return ((FLOOR + rank) / (FLOOR + 1)) ** self.exponent
-
-    def feedback(self, numbers: Numbers, td_error: Floats) -> None: ...
 
     def arrays(self, window: range) -> Arrays:
         rows = [(member, *row) for member, rows in self.running.items() for row in rows]

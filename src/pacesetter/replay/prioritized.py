@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pacesetter.replay.sampler import SampledIndices, importance_weights
+from pacesetter.replay.sampler import SampledIndices, Sampler, importance_weights
 from pacesetter.types import Arrays, Floats, Numbers, Reals, Shape
 
 BLOCK = 32  # priorities per sum
@@ -29,7 +29,7 @@ MEASURES: dict[str, Callable[[Reals], Reals]] = {
 }
 
 
-class ByError:
+class ByError(Sampler):
     """Rows in proportion to a power of their last TD error: PER (Schaul et al. 2016), and LAP
     (Fujimoto et al. 2020, sfujim/TD7) with its own measure of the error and without weights.
 
@@ -46,10 +46,6 @@ class ByError:
         self.largest = 1.0
         self.updates = 0
         self.known = 0  # rows below this number have a priority
-
-    def add(self, number: int, member: int, earned: float) -> None: ...
-
-    def end(self, member: int, total: float | None) -> None: ...
 
     def sample(
         self, rng: np.random.Generator, shape: Shape, window: range, done: float

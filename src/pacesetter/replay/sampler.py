@@ -1,10 +1,10 @@
-"""Which transitions of a replay a minibatch takes: the interface of every sampler, and the uniform.
+"""Which transitions of a replay a minibatch takes: uniformly, if no other sampler is used.
 
 A sampler stands beside the ring. It hears of every row and episode, samples row numbers from the
 window, takes the errors of an update and goes to the checkpoint as arrays.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,54 +18,32 @@ class SampledIndices(NamedTuple):
     weight: Floats | None
 
 
-class Sampler(Protocol):
-    """What the replay and the members tell of rows, and ask for."""
+class Sampler:
+    """Samples every row of the window with the same probability, with replacement; others override
+    what they need.
+    """
 
     def add(self, number: int, member: int, earned: float) -> None:
         """A member wrote row `number`; its episode had returned `earned` before that step."""
-        ...
 
     def end(self, member: int, total: float | None) -> None:
         """A member's episode ended with a return; None if it was abandoned unfinished."""
-        ...
 
     def sample(
         self, rng: np.random.Generator, shape: Shape, window: range, done: float
     ) -> SampledIndices:
         """Minibatches (..., B) from the rows in the window; `done` is the share of the horizon."""
-        ...
+        return SampledIndices(window.start + rng.integers(len(window), size=shape), None)
 
     def feedback(self, numbers: Numbers, td_error: Floats) -> None:
         """Absolute TD errors (U, B) of sampled rows, before any further row is added."""
-        ...
 
     def arrays(self, window: range) -> Arrays:
         """Everything that a checkpoint must hold."""
-        ...
+        return {}
 
     def restore(self, arrays: Arrays, window: range) -> None:
         """The inverse of `arrays`; errors are those of foreign arrays (storage.FAULTS)."""
-        ...
-
-
-class Uniform:
-    """Samples every row of the window with the same probability, with replacement."""
-
-    def add(self, number: int, member: int, earned: float) -> None: ...
-
-    def end(self, member: int, total: float | None) -> None: ...
-
-    def sample(
-        self, rng: np.random.Generator, shape: Shape, window: range, done: float
-    ) -> SampledIndices:
-        return SampledIndices(window.start + rng.integers(len(window), size=shape), None)
-
-    def feedback(self, numbers: Numbers, td_error: Floats) -> None: ...
-
-    def arrays(self, window: range) -> Arrays:
-        return {}
-
-    def restore(self, arrays: Arrays, window: range) -> None: ...
 
 
 def importance_weights(priority: Reals, importance: float, done: float) -> Floats | None:

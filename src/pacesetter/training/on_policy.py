@@ -6,7 +6,7 @@ one update from the whole rollout, then its observations join them      learn
 A checkpoint falls between iterations, so it holds no rollout: only running episodes.
 """
 
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,21 +79,9 @@ class OnPolicyLoop:
             explorer.env.close()
         self.source.close()
 
-    @cached_property
-    def loss_names(self) -> list[str]:
-        """Names of the losses, in the order of their columns."""
-        return self.learners.compiled.loss_names(self.learners.states[0], *self.source.shape())
-
-    def ledger(self) -> dict[str, Any]:
-        """What the run has spent."""
-        progress, learners = self.progress, self.learners
-        actions = progress.members[0].actions
-        extra = learners.compiled.learner.ledger(learners.states, progress.updates, actions)
-        return progress.ledger() | extra
-
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""
-        return self.progress.training_values(self.loss_names)
+        return self.progress.training_values()
 
     def policy(self, member: int) -> Policy:
         """The policy as it is now."""
@@ -128,7 +116,7 @@ class OnPolicyLoop:
         data, extra = self.source.data(rows, progress.updates)
         inputs = (progress.updates, data, None, self.normalizer.statistics(), extra)
         (result,) = self.learners.update([0], [inputs])
-        progress.add_losses(self.loss_names, result.losses)
+        progress.add_losses(self.learners.loss_names, result.losses)
         progress.updates += 1
         progress.transitions += int(extra.get("valid", len(rows)))
         for observation in self.layout.unpack(rows).observation:

@@ -25,10 +25,6 @@ class LastRollout:
         self.length = config.hyper.rollout_length
         self.replays: list[Replay] = []
 
-    def shape(self) -> Data:
-        """Data of the right shape."""
-        return np.zeros((self.length, self.envs, self.layout.width), np.float32), {}
-
     def open(self, path: Path, budget: int) -> None:
         """Nothing lies in a file."""
 
@@ -62,12 +58,6 @@ class AllSteps:
         self.size = hyper.replay_size
         self.env = Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, hyper.parallel_envs)
         self.replays: list[Replay] = []
-
-    def shape(self) -> Data:
-        """Data of the right shape."""
-        rows = np.zeros((self.capacity, self.layout.width), np.float32)
-        starts = np.zeros((self.starts, self.layout.spec.observation_size), np.float32)
-        return rows, {"starts": starts, "valid": 0}
 
     def open(self, path: Path, budget: int) -> None:
         """Make or find the ring."""

@@ -1,7 +1,6 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,20 +22,7 @@ from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import out_of_time
 from pacesetter.training import checkpoint
 from pacesetter.training.on_policy import OnPolicyLoop
-
-
-@dataclass(frozen=True)
-class Report:
-    """One row of the log: an evaluation, a selection, or how training went since the last row."""
-
-    kind: str
-    step: int
-    values: dict[str, Any]
-    ledger: dict[str, Any]
-
-    def row(self) -> dict[str, Any]:
-        """As the line of metrics.jsonl."""
-        return {"kind": self.kind, "step": self.step, **self.values, **self.ledger}
+from pacesetter.training.report import Report
 
 
 class Trainer:
@@ -96,19 +82,16 @@ class Trainer:
             self.loop.open_replays(self.directory.state_file.parent)
             self.notes = checkpoint.restore(self.loop, self.config, self.directory)
             if self.progress.step > self.budget:
-                raise UsageError(
-                    f"steps: the run has made {self.progress.step:,} already; give more"
-                )
-            backend = jax.default_backend()
-            self.directory.note_resume(self.config, self.progress.step, backend)
+                made = f"{self.progress.step:,}"
+                raise UsageError(f"steps: the run has made {made} already; give more")
+            self.directory.note_resume(self.config, self.progress.step, jax.default_backend())
         except BaseException:
             self.directory.unlock()
             raise
         return self
 
     def _begin(self) -> None:
-        run = self.config.run
-        hyper = self.config.hyper
+        run, hyper = self.config
         on_policy = isinstance(hyper, OnPolicy)
         envs = [
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
@@ -145,9 +128,8 @@ class Trainer:
             self.save()
             raise
         except OSError as error:
-            raise TrainingError(
-                f"step {self.progress.step}: {self.directory.path}: {error.strerror or error}"
-            ) from error
+            where = f"step {self.progress.step}: {self.directory.path}"
+            raise TrainingError(f"{where}: {error.strerror or error}") from error
         finally:
             self.close()
 
@@ -191,9 +173,8 @@ class Trainer:
 
     def _refuse_closed(self) -> None:
         if self._closed:
-            raise UsageError(
-                f"run: this trainer has ended; Trainer.resume('{self.directory.path}')"
-            )
+            path = self.directory.path
+            raise UsageError(f"run: this trainer has ended; Trainer.resume('{path}')")
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
@@ -203,6 +184,11 @@ class Trainer:
         policy.about.update({name: getattr(run, name) for name in names})
         policy.about.update(step=self.progress.step, versions=versions())
         return policy
+
+    def ledger(self) -> dict[str, Any]:
+        """What the run has spent."""
+        progress = self.progress
+        return progress.ledger() | self.loop.learners.ledger(progress.updates, progress.actions)
 
     # What is due: evaluations, rows of the log, checkpoints.
 
@@ -239,15 +225,16 @@ class Trainer:
 
     def _trial(self, policy: Policy, member: int) -> Evaluation:
         run, progress = self.config.run, self.progress
-        if self._evaluation_env is None:
-            env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
-            self._evaluation_env = env
+        env = self._evaluation_env or Environment(
+            run.env, run.env_kwargs, run.seed, Stream.EVALUATE
+        )
+        self._evaluation_env = env
         with blame(member, progress.step):
-            return rollouts(policy.act, self._evaluation_env, run.eval_episodes)
+            return rollouts(policy.act, env, run.eval_episodes)
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
-        report = Report(kind, self.progress.step, values, self.loop.ledger())
+        report = Report(kind, self.progress.step, values, self.ledger())
         self.directory.append(report.row())
         self._reports.append(report)
 
