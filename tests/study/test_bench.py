@@ -626,7 +626,7 @@ RAY_CANCELS = """
 import _thread, signal, sys, threading, time
 from pathlib import Path
 signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in what a script starts in the background
-from pacesetter.study.executors import run_command
+from pacesetter.study.bench.executors import run_command
 
 def cancel():
     while not Path(sys.argv[1]).exists():
