@@ -454,11 +454,11 @@ def test_cycles_in_float32_equal_the_reference(minibatches: Minibatches) -> None
 def test_ddpg_is_td3_without_its_tricks(minibatches: Minibatches) -> None:
     """One critic, no delay, no smoothing: the same bits after five cycles."""
     ours, theirs = learner("td3", critics=1, policy_delay=1, target_noise=0), learner("ddpg")
-    a = b = fresh(ours)
+    a, b = fresh(ours), fresh(theirs)
     for cycle in range(5):
         batch, key = minibatches(1, 16), jax.random.key(cycle)
         a, b = update(ours, a, batch, key), update(theirs, b, batch, key)
-        assert same(a, b)
+        assert same(*map(jax.tree.leaves, (a, b)))  # DDPG's Adam stands in a chain, for its decay
         a, b = a.state, b.state
 
 

@@ -92,6 +92,16 @@ class Plain(Learner):
     def ledger(self, states: Any, updates: int, actions: int) -> dict[str, int]:
         return {"plain_updates": updates}
 
+    def copy_weights(self, own: State, parent: State) -> State:
+        return parent._replace(
+            actor_opt_state=own.actor_opt_state,
+            critic_opt_state=own.critic_opt_state,
+            updates=own.updates,
+        )
+
+    def copy_actor(self, own: State, parent: State) -> State:
+        return own._replace(actor=parent.actor, actor_opt_state=self._adam.init(parent.actor))
+
     def policy(self, state: State) -> Actors:
         one = jax.tree.map(lambda x: x[None], state.actor)
         return Actors(one, activation="relu", output="tanh")
