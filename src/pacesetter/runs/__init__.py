@@ -1,0 +1,13 @@
+"""Run directories: their files, what a result needs to be repeated, and what a run may spend."""
+
+from pacesetter.runs.directory import (
+    FREE_PER_SEED,
+    IN_USE,
+    SCHEMA,
+    Row,
+    RunDirectory,
+    find,
+    find_all,
+)
+
+__all__ = ["FREE_PER_SEED", "IN_USE", "SCHEMA", "Row", "RunDirectory", "find", "find_all"]
