@@ -89,7 +89,7 @@ def draw(run: RunDirectory, policy: Policy) -> None:
     curve(run, "demo.png")
     say("demo.png: the learning curve")
     try:
-        record(policy, "demo.mp4", frames=200, size=(320, 240), seed=SEED)
+        record(policy, "demo.mp4", frames=200, size=(640, 480), seed=SEED)
     except UsageError as error:
         say(str(error))
     else:

@@ -87,7 +87,7 @@ def _all() -> list[RunDirectory]:
 HELP = {
     "resume": ["RUN", "--steps", "--time", "--runs", "--quiet"],
     "eval": ["RUN|FILE", "--episodes", "--seed", "--noise", "--env", "--json", "--runs"],
-    "list": ["algorithms|envs|rules|presets|suites|runs", "--runs"],
+    "list": ["algorithms|envs|rules|presets|suites|champions|runs", "--runs"],
     "bench": ["SUITE|FILE.toml", "pilot", "--algos", "--envs", "--seeds", "--jobs", "--print"],
     "tune": ["ALGO", "ENV", "--trials", "--study"],
     "show": ["RUN", "--runs"],

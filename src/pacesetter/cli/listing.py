@@ -82,12 +82,24 @@ def suites() -> list[str]:
     return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
 
 
+def champions() -> list[str]:
+    """Policies that come with the package."""
+    from pacesetter.cli.policies import CHAMPION, champions
+    from pacesetter.policy import load
+
+    found = [(name, load(file).about) for name, file in champions().items()]
+    return _table(
+        [(f"{CHAMPION}{name}", about["env"], f"step {about['step']:,}") for name, about in found]
+    )
+
+
 LISTS = {
     "algorithms": algorithms,
     "envs": envs,
     "rules": rules,
     "presets": presets,
     "suites": suites,
+    "champions": champions,
 }
 
 

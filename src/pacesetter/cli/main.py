@@ -8,6 +8,8 @@ from pacesetter.cli.bench import bench
 from pacesetter.cli.compare import compare
 from pacesetter.cli.evaluate import evaluate
 from pacesetter.cli.listing import list_, show
+from pacesetter.cli.pictures import poster, record, watch
+from pacesetter.cli.share import export, fetch, push
 from pacesetter.cli.train import resume, train
 from pacesetter.cli.tune import tune
 from pacesetter.errors import TrainingError, UsageError, unknown
@@ -21,6 +23,12 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "compare": compare,
     "bench": bench,
     "tune": tune,
+    "record": record,
+    "poster": poster,
+    "watch": watch,
+    "export": export,
+    "push": push,
+    "fetch": fetch,
 }
 
 

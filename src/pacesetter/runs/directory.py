@@ -14,8 +14,8 @@ from typing import Any
 from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs.provenance import provenance
-from pacesetter.storage import TEMPORARY, write_atomically
 from pacesetter.settings.validation import difference
+from pacesetter.storage import TEMPORARY, write_atomically
 
 SCHEMA = 1
 IN_USE = "is in use by"

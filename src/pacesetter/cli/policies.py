@@ -1,0 +1,93 @@
+"""Which policy a word of the command line means: a run's, a file's or a shipped champion's."""
+
+from argparse import Namespace
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pacesetter.cli.flags import Parser, split_env_kwargs
+from pacesetter.errors import UsageError, unknown
+from pacesetter.settings import Settings
+
+if TYPE_CHECKING:
+    from pacesetter.policy import Policy
+
+CHAMPION = "champion:"
+RUN = "run folder, the end of its path, a policy file, or champion:NAME"
+
+
+class Found(NamedTuple):
+    """A policy, its file, and the task and keywords to play it with."""
+
+    policy: "Policy"
+    file: Path
+    env: str | None
+    env_kwargs: Settings
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """As the functions of `media` take it."""
+        return {"env": self.env, "env_kwargs": self.env_kwargs}
+
+
+def add_run(command: Parser) -> None:
+    """RUN, and the flags of the task that its policy plays."""
+    command.add_argument("run", metavar="RUN|FILE", help=RUN)
+    command.add_argument("--env", metavar="ID", help="task to play (default the policy's own)")
+    command.add_env_keywords()
+    command.add_runs()
+
+
+def add_seed(command: Parser) -> None:
+    """`--seed`, of start states."""
+    about = "seed of the start states (default 0)"
+    command.add_argument("--seed", type=int, default=0, metavar="N", help=about)
+
+
+def parse(command: Parser, words: list[str]) -> tuple[Namespace, Found]:
+    """The flags, and the policy that RUN means."""
+    from pacesetter.policy import load
+
+    words, env_kwargs = split_env_kwargs(words)
+    given = command.parse(words)
+    if getattr(given, "seed", 0) < 0:
+        raise UsageError(f"seed: must be at least 0, got {given.seed}")
+    file, env = policy_file(given.run, given.env, given.runs)
+    policy = load(file)
+    own = policy.about.get("env")
+    if (env or own) == own:
+        env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
+    return given, Found(policy, file, env, env_kwargs)
+
+
+def policy_file(run: str, env: str | None, runs: str) -> tuple[Path, str | None]:
+    """The policy file that is meant, and the task if it is named or a run's own.
+
+    A run is of this machine, so its task is trusted; a file's task may import a module only if
+    `env` names it.
+    """
+    from pacesetter.runs import find
+
+    if run.startswith(CHAMPION):
+        return champion(run.removeprefix(CHAMPION)), env
+    if Path(run).suffix == ".safetensors":
+        return Path(run), env
+    found = find(run, runs)
+    if not found.policy_file.exists():
+        raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")
+    return found.policy_file, env or found.settings()["env"]
+
+
+def champion(name: str) -> Path:
+    """The file of a shipped policy."""
+    known = champions()
+    if name not in known:
+        raise unknown("champion", name, known, "pacesetter list champions")
+    return known[name]
+
+
+def champions() -> dict[str, Path]:
+    """Shipped policies by name: inside an installed package, beside `src` in a checkout."""
+    inside = Path(str(files("pacesetter"))) / "champions"
+    folder = inside if inside.is_dir() else Path(__file__).parents[3] / "champions"
+    return {file.stem: file for file in sorted(folder.glob("*.safetensors"))}
