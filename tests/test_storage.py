@@ -79,7 +79,7 @@ def test_table_is_read_back(tmp_path: Path) -> None:
 
 def test_kind_is_checked(tmp_path: Path) -> None:
     storage.write(tmp_path / "file", "thing", Content({}, {}))
-    with pytest.raises(UsageError, match="no pacesetter other"):
+    with pytest.raises(UsageError, match="not a pacesetter other"):
         storage.read(tmp_path / "file", "other")
 
 

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 from numeric import KEY, close, member, random_batch, random_state, slopes, squashed
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.algorithms import crossq
 from pacesetter.batch import Spec
 from pacesetter.config import resolve

@@ -530,7 +530,7 @@ def test_nothing_is_nan(runs: Path, nans_raise: None) -> None:
         ("multi-trpo", {}, "members: trpo trains one member.* must stay 1, got 2"),
         ("trpo", {"rule": "none"}, "rule: trpo trains one member.* must stay best, got none"),
         ("trpo", {"replay_scope": "member"}, "replay_scope: .* must stay shared"),
-        ("trpo", {"steps": 100}, "steps: 100 are less than one rollout of 1024"),
+        ("trpo", {"steps": 100}, "steps: 100 is less than one rollout of 1024"),
         ("trpo", {"batch_size": 64}, "setting: unknown 'batch_size'"),
         (
             "trpo",

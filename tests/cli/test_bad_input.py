@@ -534,7 +534,7 @@ def test_checkpoint_of_another_run(run: RunDirectory, refused: Refused) -> None:
 def test_policy_for_a_checkpoint(run: RunDirectory, refused: Refused) -> None:
     for file in (run.state_file, run.previous_file):
         shutil.copy(run.policy_file, file)
-    says(refused("resume", run.path), ["state.safetensors", "no pacesetter checkpoint"])
+    says(refused("resume", run.path), ["state.safetensors", "not a pacesetter checkpoint"])
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

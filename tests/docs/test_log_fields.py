@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from short_runs import TINY, run_to_end
 
-from conftest import TINY, run_to_end
 from pacesetter.training.trainer import Trainer
 
 PAGE = Path(__file__).parents[2] / "docs" / "log-fields.md"

@@ -70,7 +70,11 @@ def test_runs_are_found_by_folder_tail_pattern_and_file(runs: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("word", "said"),
-    [("nothing/9", "'nothing/9' not found"), ("no*", "fits no run"), ("a.txt", "neither a run's")],
+    [
+        ("nothing/9", "'nothing/9' not found"),
+        ("no*", "matches no run"),
+        ("a.txt", "neither a run's"),
+    ],
 )
 def test_what_is_not_found_is_one_line(runs: Path, word: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("x")
@@ -139,7 +143,7 @@ def test_equal_cpu_time_cuts_each_run_where_it_stood(tmp_path: Path) -> None:
     alone = compare([tmp_path], cpu=spent[1])
     assert [run.seed for run in alone.runs] == [1]
     assert "CPU seconds)" in alone.notes[0]
-    with pytest.raises(UsageError, match="cpu: cuts runs at another place than --budget"):
+    with pytest.raises(UsageError, match="cpu: limits runs otherwise than --budget does"):
         compare([tmp_path], cpu="1m", budget="10k")
 
 
@@ -428,7 +432,7 @@ def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> No
         (["--metric", "best"], "metric: unknown 'best'"),
         (["--budget", "many"], "budget: is not a count"),
         (["-o", "a.doc"], "-o: a.doc must end in .html"),
-        (["-o", "none/a.md"], "-o: none is no folder"),
+        (["-o", "none/a.md"], "-o: none is not a folder"),
         (["--smooth", "4"], "smooth: must be an odd number"),
         (["--budget", "1M"], "none is complete"),
     ],

@@ -159,7 +159,7 @@ def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> N
 
 FAULTS = {
     "nan": "observation: must be finite, number 2 is nan",
-    "reward": "reward: must be finite in float32, it is -inf",
+    "reward": "reward: must be finite in float32, got -inf",
     "error": "a bolt fell out",
 }
 

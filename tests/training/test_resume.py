@@ -7,6 +7,8 @@ import pytest
 from short_runs import TINY, assert_same, run_to_end
 from stopping import stop_at
 
+from pacesetter import storage
+from pacesetter.errors import UsageError
 from pacesetter.replay import buffer
 from pacesetter.training.trainer import Trainer
 
@@ -131,3 +133,16 @@ def test_stopped_anywhere_equals_uninterrupted(
         stopped = Trainer.resume(stopped.directory.path)
         assert stopped.notes == []
     assert_same(whole, run_to_end(stopped))
+
+
+def test_checkpoint_of_an_earlier_version_is_refused_in_one_line(runs: Path) -> None:
+    """It says which version made it and what to do, and leaves the file as it is."""
+    directory = run_to_end(start("td3", runs, "older"))
+    for file in (directory.state_file, directory.previous_file):
+        arrays, table = storage.read(file, "checkpoint")
+        storage.write(file, "checkpoint", storage.Content(arrays, table | {"schema": 3}))
+    before = directory.state_file.read_bytes()
+    with pytest.raises(UsageError, match=r"schema 3 .*earlier pacesetter 0\.1.*--name$"):
+        Trainer.resume(directory.path)
+    assert directory.state_file.read_bytes() == before
+    assert not directory.in_use()

@@ -20,6 +20,10 @@ KIND = "checkpoint"
 SCHEMA = 4
 
 
+class _OlderError(UsageError):
+    """A whole checkpoint that an earlier version made."""
+
+
 def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
     """Write the checkpoint; the one before it stays as previous.safetensors."""
     arrays: Arrays = {}
@@ -45,6 +49,8 @@ def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
     for file in (file for file in files if file.exists()):
         try:
             _restore(loop, config, directory, file, notes)
+        except _OlderError:
+            raise
         except UsageError as error:
             notes.append(f"{error}; trying the checkpoint before it")
             continue
@@ -82,9 +88,10 @@ def _restore(
 def _refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None:
     schema = table.get("schema")
     if schema == 3:
-        raise UsageError(
-            f"{file}: checkpoint schema 3 was made by pacesetter 0.1.0 before schema 4; finish the "
-            "run with that version, or train it again under another --name"
+        raise _OlderError(
+            f"{file}: checkpoint schema 3 was made by an earlier pacesetter 0.1, this version reads "
+            f"{SCHEMA}; resume the run with the commit that its config.json names, or train it "
+            "again under another --name"
         )
     if schema != SCHEMA:
         raise UsageError(f"{file}: checkpoint schema {schema}, this version reads {SCHEMA}")

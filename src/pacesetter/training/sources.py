@@ -14,7 +14,7 @@ from pacesetter.seeding import Stream
 from pacesetter.types import Floats
 
 Data = tuple[Floats, dict[str, Any]]  # rows and the batch's other fields
-FEWEST = 250  # rows, of which a fifth is held out by a fit
+MIN_ROLLOUT = 250  # rows, of which a fifth is held out by a fit
 
 
 class LastRollout:
@@ -50,9 +50,9 @@ class AllSteps:
         self.layout, self.starts = layout, hyper.starts
         self.capacity = min(hyper.replay_size, run.steps)
         rollout = self.rollout = hyper.parallel_envs * hyper.rollout_length
-        if not FEWEST <= rollout <= min(UNCOMMITTED, hyper.replay_size):
+        if not MIN_ROLLOUT <= rollout <= min(UNCOMMITTED, hyper.replay_size):
             raise UsageError(
-                f"rollout_length: a rollout of all envs must have {FEWEST} to "
+                f"rollout_length: a rollout of all envs must have {MIN_ROLLOUT} to "
                 f"{min(UNCOMMITTED, hyper.replay_size)} steps, it has {rollout}"
             )
         self.size = hyper.replay_size
