@@ -22,6 +22,7 @@ from pacesetter.study.report.figures import pdf
 HERE = Path(__file__).parent
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
+    "paper": [{"budget": "1M"}],
     "pilot": [
         {"budget": "100k"},
         {"budget": "100k", "reference": "multi-td3"},

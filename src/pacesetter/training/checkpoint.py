@@ -89,9 +89,9 @@ def _refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None
     schema = table.get("schema")
     if schema == 3:
         raise _OlderError(
-            f"{file}: checkpoint schema 3 was made by an earlier pacesetter 0.1, this version reads "
-            f"{SCHEMA}; resume the run with the commit that its config.json names, or train it "
-            "again under another --name"
+            f"{file}: checkpoint schema 3 was made by an earlier pacesetter 0.1, this version "
+            f"reads {SCHEMA}; resume the run with the commit that its config.json names, or train "
+            "it again under another --name"
         )
     if schema != SCHEMA:
         raise UsageError(f"{file}: checkpoint schema {schema}, this version reads {SCHEMA}")
