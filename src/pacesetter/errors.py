@@ -29,7 +29,7 @@ def unknown(
     near = get_close_matches(word, options, n=3, cutoff=0.6)
     if near:
         hint = f"did you mean {' or '.join(near)}?"
-    elif len(options) <= 12:
+    elif len(options) <= 16:
         hint = f"allowed: {', '.join(options)}"
     else:
         hint = f"{len(options)} are known; see `{see}`"

@@ -723,7 +723,7 @@ def file(here: Path) -> Path:
 def test_whole_policy_file_is_taken(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What the tests below damage is fine as it is."""
     assert main(["eval", str(file), "--episodes", "1"]) == 0
-    assert "over 1 episodes" in capsys.readouterr().out
+    assert "over 1 episode of" in capsys.readouterr().out
 
 
 def damaged(file: Path, data: bytes) -> None:
