@@ -102,39 +102,39 @@ def test_every_entry_settles(name: str, entry: str) -> None:
         assert job.directory.path.parts[-2:] == (entry, str(job.config.run.seed))
 
 
-BASES = {("sac", 1, "", 1), ("sunrise", 1, "", 1)}
+TASKS = ("HalfCheetah-v4", "Walker2d-v4", "pacesetter/Ant111-v4")
 
 
-@pytest.mark.parametrize(
-    ("name", "budget", "warmup", "others"),
-    [("paper-table-1", 200_000, 10_000, BASES), ("paper-table-2", 1_000_000, 25_000, set())],
-)
-def test_papers_tables_have_every_control(
-    name: str, budget: int, warmup: int, others: set[Any]
-) -> None:
-    """td3 for twice the budget, with two updates; selection none and random; on all three tasks.
+def budgets(name: str) -> dict[tuple[str, str, int], int]:
+    """Env steps of each run of a shipped suite by task, name and seed."""
+    runs = [job.config.run for job in expand(load(name), {}, "runs")]
+    return {(run.env, run.name, run.seed): run.steps for run in runs}
 
-    Table I has SUNRISE and its base too; everyone has the same warm-up.
-    """
-    tasks = {"pacesetter/Ant111-v4", "HalfCheetah-v4", "Walker2d-v4"}
-    runs = [(job.config.run, job.config.hyper) for job in expand(load(name), {}, "runs")]
-    assert {run.env for run, _ in runs} == tasks
-    for env in tasks:
-        for seed in range(3):
-            here = [(r, h) for r, h in runs if (r.env, r.seed) == (env, seed)]
-            seen = {
-                (r.algorithm, r.members, r.rule if r.members > 1 else "", h.updates_per_step)
-                for r, h in here
-            }
-            assert seen == others | {
-                ("td3", 1, "", 1),
-                ("td3", 1, "", 2),
-                ("td3", 2, "best", 1),
-                ("td3", 2, "none", 1),
-                ("td3", 2, "random", 1),
-            }
-            assert {r.name: r.steps for r, _ in here if r.steps != budget} == {"td3": 2 * budget}
-            assert {h.warmup for _, h in here} == {warmup}
+
+def test_paper_table_1() -> None:
+    names = ("multi-td3", "sunrise", "sac")
+    wanted = {(env, name, seed): 50_000 for env in TASKS for name in names for seed in range(3)}
+    assert budgets("paper-table-1") == wanted
+    found = expand(load("paper-table-1"), {}, "runs")
+    assert {job.config.hyper.warmup for job in found} == {10_000}
+
+
+def test_paper_table_2() -> None:
+    """A million steps, both readings of multi-td3 on HalfCheetah, controls on Walker2d."""
+    names = ("td3", "multi-td3")
+    wanted = {(env, name, seed): 10**6 for env in TASKS for name in names for seed in range(3)}
+    wanted |= {("HalfCheetah-v4", "multi-td3", seed): 2 * 10**6 for seed in range(3)}
+    for name in ("multi-td3-none", "multi-td3-random"):
+        wanted |= {("Walker2d-v4", name, seed): 500_000 for seed in range(3)}
+    assert budgets("paper-table-2") == wanted
+    found = {job.config.run.name: job.config.run for job in expand(load("paper-table-2"), {}, "r")}
+    assert (found["multi-td3-none"].rule, found["multi-td3-random"].rule) == ("none", "random")
+
+
+def test_settings_by_task_are_tables(here: Path) -> None:
+    (here / "odd.toml").write_text('envs = ["Pendulum-v1"]\n[entries.td3]\nenv = "Pendulum-v1"\n')
+    with pytest.raises(UsageError, match="env: must be tables of settings by task"):
+        expand(load("odd.toml"), {}, "runs")
 
 
 def test_pilot() -> None:

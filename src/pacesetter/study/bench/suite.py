@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,11 +93,23 @@ def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
         try:
             for env in _envs(merged.get("envs")):
                 below = _file(suite, merged.get("config"), env)
-                own = {**suite.shared, **below, **entry, **flags}
+                own = {**suite.shared, **below, **_for_env(entry, env), **flags}
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
     return sorted(jobs, key=lambda job: job.config.run.seed)
+
+
+def _for_env(entry: Settings, env: str) -> Settings:
+    """An entry's settings for a task: `env."PATTERN"` tables win over the rest, as in presets."""
+    by_env: Any = entry.get("env", {})
+    if not isinstance(by_env, dict) or not all(isinstance(t, dict) for t in by_env.values()):
+        raise UsageError('env: must be tables of settings by task, such as env."HalfCheetah-*"')
+    found = {key: value for key, value in entry.items() if key != "env"}
+    for pattern, table in by_env.items():
+        if fnmatchcase(env, pattern):
+            found |= _with_underscores(table)
+    return found
 
 
 def _jobs(
