@@ -37,6 +37,8 @@ def act(policy: tuple[dict[str, Any], dict[str, Any]], observation: Any) -> Any:
 
 def _actor(arrays: dict[str, Any], table: dict[str, Any], n: int, x: Any) -> Any:
     """The action in [-1, 1] of one network."""
+    if f"actors.{n}.0.encoder_kernel_1" in arrays:
+        raise SystemExit("a policy of td7 reads an encoder; export it to ONNX instead")
     i = 0
     while f"actors.{n}.{i + 1}.kernel" in arrays:
         x = x @ arrays[f"actors.{n}.{i}.kernel"] + arrays[f"actors.{n}.{i}.bias"]

@@ -14,8 +14,14 @@ from pacesetter.types import Floats, Layers, Shape
 
 KIND = "policy"
 SCHEMA = 1
-LAYERS = ({"kernel", "bias"}, {"kernel", "bias", "scale", "offset"})
+ENCODER = [(f"encoder_kernel_{i}", f"encoder_bias_{i}") for i in (1, 2, 3)]
+LAYERS = (
+    {"kernel", "bias"},
+    {"kernel", "bias", "scale", "offset"},
+    {"kernel", "bias", *(name for pair in ENCODER for name in pair)},
+)
 NORM_EPSILON = np.float32(1e-5)
+LENGTH_EPSILON = np.float32(1e-8)
 OBSERVATION_LIMIT = 10.0
 
 
@@ -28,6 +34,15 @@ def clip(x: Floats, low: float = -1.0, high: float = 1.0) -> Floats:
     return np.minimum(np.maximum(x, np.float32(low)), np.float32(high))
 
 
+def elu(x: Floats) -> Floats:
+    return np.maximum(x, np.expm1(np.minimum(x, np.float32(0))))
+
+
+def average_l1(x: Floats) -> Floats:
+    """Vectors (..., n) over their mean absolute number (TD7)."""
+    return x / np.maximum(np.abs(x).mean(axis=-1, keepdims=True), LENGTH_EPSILON)
+
+
 ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"relu": relu, "tanh": np.tanh}
 OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": clip}
 
@@ -35,6 +50,9 @@ OUTPUTS: dict[str, Callable[[Floats], Floats]] = {"tanh": np.tanh, "clip": clip}
 def forward(layers: Layers, x: Floats, activation: Callable[[Floats], Floats] = relu) -> Floats:
     """The linear output (..., outputs) of one network, as `mlp.apply` gives it in JAX."""
     for layer in layers[:-1]:
+        if has_encoder(layer):
+            x = embed(layer, x)
+            continue
         x = x @ layer["kernel"] + layer["bias"]
         if "scale" in layer:
             centred = x - x.mean(axis=-1, keepdims=True)
@@ -42,6 +60,21 @@ def forward(layers: Layers, x: Floats, activation: Callable[[Floats], Floats] = 
             x = centred / np.sqrt(variance + NORM_EPSILON) * layer["scale"] + layer["offset"]
         x = activation(x)
     return x @ layers[-1]["kernel"] + layers[-1]["bias"]
+
+
+def has_encoder(layer: dict[str, Floats]) -> bool:
+    """Whether a layer is TD7's first stage."""
+    return ENCODER[0][0] in layer
+
+
+def embed(layer: dict[str, Floats], x: Floats) -> Floats:
+    """TD7's first stage: a linear embedding of x beside what the state encoder makes of x."""
+    encoded = x
+    for kernel, bias in ENCODER[:-1]:
+        encoded = elu(encoded @ layer[kernel] + layer[bias])
+    kernel, bias = ENCODER[-1]
+    parts = (x @ layer["kernel"] + layer["bias"], encoded @ layer[kernel] + layer[bias])
+    return np.concatenate([average_l1(part) for part in parts], axis=-1)
 
 
 class Actors(NamedTuple):
@@ -190,13 +223,22 @@ def _check_layers(layers: Layers, size: int) -> int:
     for layer in layers:
         if layer.keys() not in LAYERS:
             raise ValueError(f"a layer has {', '.join(sorted(layer))}")
-        shape = layer["kernel"].shape
-        if len(shape) != 2 or shape[0] != size:
-            raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")
-        size = shape[1]
-        if any(x.shape != (size,) for name, x in layer.items() if name != "kernel"):
-            raise ValueError("a layer's bias or norm does not fit it")
+        size = _outputs(layer, size)
     return size
+
+
+def _outputs(layer: dict[str, Floats], size: int) -> int:
+    """How many numbers a layer makes of `size`."""
+    encoded = size
+    for kernel, bias in ENCODER if has_encoder(layer) else ():
+        encoded = _outputs({"kernel": layer[kernel], "bias": layer[bias]}, encoded)
+    shape = layer["kernel"].shape
+    if len(shape) != 2 or shape[0] != size:
+        raise ValueError(f"a layer of shape {shape} follows one of {size} numbers")
+    beside = [layer[name] for name in ("bias", "scale", "offset") if name in layer]
+    if any(x.shape != shape[1:] for x in beside):
+        raise ValueError("a layer's bias or norm does not fit it")
+    return shape[1] + (encoded if has_encoder(layer) else 0)
 
 
 def _shapes(table: Any) -> tuple[Shape, Shape] | None:

@@ -3,6 +3,7 @@
 import json
 import runpy
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from pacesetter import load
 from pacesetter.errors import UsageError
 from pacesetter.media.export import export
-from pacesetter.policy import ACTIVATIONS, OUTPUTS, Policy
+from pacesetter.policy import ACTIVATIONS, ENCODER, OUTPUTS, Policy
 
 onnx = pytest.importorskip("onnx", reason="needs the extra onnx")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
@@ -49,6 +50,24 @@ def handmade(
 def run(path: Path, observation: Any) -> Any:
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return session.run(None, {"observation": observation})[0]
+
+
+def test_encoder_of_td7_is_part_of_the_model(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Its first stage: the linear embedding beside the state encoder's, each of mean length 1."""
+    plain = handmade(rng, "relu", "tanh", 1, norm=False, scaled=True)
+    sizes = [(11, 16), (16, 16), (16, 8)]
+    encoder: dict[str, Any] = {}
+    for (kernel, bias), shape in zip(ENCODER, sizes, strict=True):
+        encoder |= {kernel: rng.normal(0, 0.4, shape).astype(np.float32)}
+        encoder |= {bias: rng.normal(0, 0.4, shape[1:]).astype(np.float32)}
+    first, second, last = plain.actors[0]
+    wider = second | {"kernel": rng.normal(0, 0.2, (40, 32)).astype(np.float32)}
+    policy = replace(plain, actors=[[first | encoder, wider, last]])
+    export(policy, "onnx", tmp_path / "walker.onnx")
+    observation = rng.normal(size=(7, 11)).astype(np.float32)
+    found = run(tmp_path / "walker.onnx", observation)
+    np.testing.assert_allclose(found, policy(observation), atol=2e-5)
+    assert not np.allclose(found[0], found[1])
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

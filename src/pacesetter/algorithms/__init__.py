@@ -21,6 +21,7 @@ def _shipped(target: str, help: str, single_member: bool = False) -> Entry:
 
 TABLE = {
     "td3": _shipped("td3:TD3", "twin delayed DDPG (Fujimoto et al. 2018)"),
+    "td7": _shipped("td7:TD7", "TD3 with learned embeddings, LAP, checkpoints"),
     "sac": _shipped("sac:SAC", "soft actor-critic, temperature learned"),
     "crossq": _shipped("crossq:CrossQ", "SAC with batch renorm and no targets (Bhatt et al. 2024)"),
     "sunrise": _shipped("sunrise:Sunrise", "an ensemble of SAC learners (Lee et al. 2021)"),

@@ -11,6 +11,8 @@ from pacesetter.errors import UsageError
 from pacesetter.media.extras import need
 from pacesetter.policy import (
     ACTIVATIONS,
+    ENCODER,
+    LENGTH_EPSILON,
     NORM_EPSILON,
     OBSERVATION_LIMIT,
     OUTPUTS,
@@ -18,6 +20,7 @@ from pacesetter.policy import (
     Layers,
     Policy,
     forward,
+    has_encoder,
     to_env,
 )
 from pacesetter.storage import write_atomically
@@ -118,6 +121,9 @@ def _input(graph: Graph, policy: Policy) -> str:
 
 def _actor(graph: Graph, policy: Policy, layers: Layers, x: str) -> str:
     for layer in layers[:-1]:
+        if has_encoder(layer):
+            x = _embed(graph, x, layer)
+            continue
         x = graph.node("Gemm", x, layer["kernel"], layer["bias"])
         if "scale" in layer:
             x = _layer_norm(graph, x, layer["scale"], layer["offset"])
@@ -126,6 +132,30 @@ def _actor(graph: Graph, policy: Policy, layers: Layers, x: str) -> str:
     if policy.output == "clip":
         return graph.node("Clip", x, -1, 1)
     return graph.node(OPERATORS[policy.output], x)
+
+
+def _embed(graph: Graph, x: str, layer: dict[str, Array]) -> str:
+    """What `policy.embed` does."""
+    encoded = x
+    for kernel, bias in ENCODER[:-1]:
+        encoded = _elu(graph, graph.node("Gemm", encoded, layer[kernel], layer[bias]))
+    kernel, bias = ENCODER[-1]
+    parts = [
+        graph.node("Gemm", x, layer["kernel"], layer["bias"]),
+        graph.node("Gemm", encoded, layer[kernel], layer[bias]),
+    ]
+    return graph.node("Concat", *(_average_l1(graph, part) for part in parts), axis=-1)
+
+
+def _elu(graph: Graph, x: str) -> str:
+    """In single operators, since onnxruntime's own knows no float64."""
+    below = graph.node("Sub", graph.node("Exp", graph.node("Min", x, 0)), 1)
+    return graph.node("Max", x, below)
+
+
+def _average_l1(graph: Graph, x: str) -> str:
+    size = graph.node("ReduceMean", graph.node("Abs", x), axes=[-1])
+    return graph.node("Div", x, graph.node("Max", size, LENGTH_EPSILON))
 
 
 def _layer_norm(graph: Graph, x: str, scale: Array, offset: Array) -> str:
