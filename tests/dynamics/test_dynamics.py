@@ -41,13 +41,14 @@ def rows(*shape: int, seed: int = 0, noise: Any = None) -> Batch:
     if noise is not None:
         change = change + noise(action) * rng.normal(size=change.shape)
     following = (observation + size * change).astype(np.float32)
+    falls = following[..., 0] > 0
     return Batch(
         observation,
         action,
         following[..., 0],
         following,
-        discount=np.where(following[..., 0] > 0, 0, 0.99).astype(np.float32),
-        last=np.zeros(shape, np.float32),
+        discount=np.where(falls, 0, 0.99).astype(np.float32),
+        last=falls.astype(np.float32),
         weight=np.ones(shape, np.float32),
         mask=np.zeros((*shape, 0), np.float32),
     )
@@ -300,3 +301,16 @@ def test_no_key_is_used_twice() -> None:
         jax.eval_shape(jax.jit(TINY.init), KEY)
         jax.eval_shape(jax.jit(TINY.sample), models, each.observation, each.action, KEY)
         jax.eval_shape(partial(fit, TINY, epochs=2), models, data, KEY)
+
+
+def test_gamma_0_ends_nothing() -> None:
+    """With gamma 0 every discount is 0; the termination heads still learn the true ends."""
+    batch = rows(64)
+    falls = np.asarray(batch.last) > 0
+    assert 0 < falls.mean() < 1
+    models = SMALL.observe(SMALL.init(KEY), batch)
+    worth = [
+        SMALL.losses(models.networks, models.scale, stacked(each))
+        for each in (batch, batch._replace(discount=np.zeros_like(batch.discount)))
+    ]
+    np.testing.assert_array_equal(*worth)

@@ -18,16 +18,17 @@ def random_batch(rng: np.random.Generator, spec: Spec, *shape: int) -> Batch:
     def normal(*more: int) -> Any:
         return rng.normal(size=(*shape, *more))
 
-    return Batch(
+    batch = Batch(
         observation=normal(spec.observation_size),
         action=np.clip(normal(spec.action_size), -1, 1),
         reward=normal(),
         next_observation=normal(spec.observation_size),
         discount=rng.choice([0, 0.99], size=shape, p=[0.2, 0.8]),
-        last=np.zeros(shape),
+        last=None,
         weight=rng.uniform(0.5, 1.5, size=shape),
         mask=np.zeros((*shape, 0)),
     )
+    return batch._replace(last=1.0 * (batch.discount == 0))
 
 
 def random_state(algorithm: Any, rng: np.random.Generator, *networks: str) -> Any:

@@ -87,9 +87,11 @@ def test_few_seeds_get_no_bootstrap_interval() -> None:
     assert math.isnan(stats.iqm([few]).low)
     assert math.isnan(stats.improvement([(few, ONE)]).low)
     assert np.isnan(stats.profile([few], few)[1]).all()
-    nine = np.arange(9.0)  # enough for BCa, not for percentiles
-    assert math.isnan(stats.iqm([nine, nine]).low)
-    assert not math.isnan(stats.iqm([nine]).low)
+    nine, ten = np.arange(9.0), np.arange(10.0)
+    for tasks in ([nine], [nine, nine]):
+        assert math.isnan(stats.iqm(tasks).low)
+    for tasks in ([ten], [ten, ten]):
+        assert not math.isnan(stats.iqm(tasks).low)
     assert math.isnan(stats.improvement([(nine, nine)]).low)
     assert np.isnan(stats.profile([nine], nine)[1]).all()
     found = stats.iqm([ONE])

@@ -195,7 +195,8 @@ class Dynamics:
             triple = cut(truth[..., :-1])
             reward = jax.vmap(mlp.apply)(networks.reward, triple)[..., 0]
             logit = jax.vmap(mlp.apply)(networks.terminated, triple)[..., 0]
-            ended = (batch.discount == 0).astype(logit.dtype)
+            # The discount alone would call every transition an end where gamma is 0.
+            ended = ((batch.discount == 0) & (batch.last > 0)).astype(logit.dtype)
             rows += 0.5 * (reward - truth[..., -1]) ** 2
             rows += optax.sigmoid_binary_cross_entropy(logit, ended)
         return (batch.weight * rows).mean(axis=-1)

@@ -81,10 +81,10 @@ def standardize(x: Array) -> Array:
 
 
 def _standardize(x: Array) -> tuple[Array, tuple[Array, Array]]:
-    mean = x.mean(axis=-1, keepdims=True)
-    variance = jnp.square(x).mean(axis=-1, keepdims=True) - jnp.square(mean)
-    scale = jax.lax.rsqrt(jnp.maximum(variance, 0) + NORM_EPSILON)
-    standard = (x - mean) * scale
+    centred = x - x.mean(axis=-1, keepdims=True)
+    # Of the centred values, as PyTorch: E x^2 - (E x)^2 in float32 fails where the mean is large.
+    scale = jax.lax.rsqrt(jnp.square(centred).mean(axis=-1, keepdims=True) + NORM_EPSILON)
+    standard = centred * scale
     return standard, (standard, scale)
 
 

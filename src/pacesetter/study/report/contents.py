@@ -85,7 +85,7 @@ def details(comparison: Comparison) -> Table:
     headers = ["env", "algorithm", "n", "final", "SD over seeds", "IQM", "area", "max (inflated)"]
     notes = [
         f"final: {METRICS['final']}. area: {METRICS['auc']}. max: {METRICS['max']}. {INTERVAL}",
-        "IQM: interquartile mean of final, with a BCa bootstrap interval from five seeds on.",
+        "IQM: interquartile mean of final, with a BCa bootstrap interval from ten seeds on.",
     ]
     rows = sorted(rows, key=lambda row: (row[0].text, -(row[3].key or 0)))
     return Table(
