@@ -94,7 +94,7 @@ def test_few_seeds_get_no_bootstrap_interval() -> None:
         assert not math.isnan(stats.iqm(tasks).low)
     assert math.isnan(stats.improvement([(nine, nine)]).low)
     assert np.isnan(stats.profile([nine], nine)[1]).all()
-    found = stats.iqm([ONE])
+    found = stats.iqm([ten])
     assert found.low < found.value < found.high
 
 
