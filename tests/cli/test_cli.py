@@ -448,7 +448,7 @@ def test_progress_goes_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 0
     out, err = capsys.readouterr()
     assert [line.split("  ")[0] for line in err.splitlines()] == [
-        f"step {step}" for step in (0, 100, 200, 250)
+        f"step {step} of 250" for step in (0, 100, 200, 250)
     ]
     result, policy = out.splitlines()
     assert re.fullmatch(rf"{PROBE} td3 seed 0: 250 steps, return -?[\d.]+ at step 250", result)

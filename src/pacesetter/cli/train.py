@@ -82,6 +82,7 @@ def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
 
 def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
     """Train to the end or to a signal, and say where the result is."""
+    from pacesetter.cli.advice import within_warmup
     from pacesetter.cli.progress import console
 
     final: Any = None
@@ -92,6 +93,8 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
         trainers.append(trainer)
         if received:
             trainer.stop()
+        if not quiet and (line := within_warmup(trainer.config)):
+            print(f"pacesetter: {line}", file=sys.stderr)
         with console(trainer, quiet) as sink:
             for report in trainer:
                 sink(report)
@@ -103,4 +106,5 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
         print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
         return exit_code(received)
     print(f"policy: {trainer.directory.policy_file}")
+    print(f"watch it: `pacesetter record {trainer.directory.path} -o walk.mp4`")
     return 0

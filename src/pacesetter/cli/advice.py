@@ -1,0 +1,81 @@
+"""What a person should know of a run's settings before hours are spent on it."""
+
+from datetime import timedelta
+from math import inf
+from typing import TYPE_CHECKING, Any
+
+from pacesetter.settings.budget import budget
+
+if TYPE_CHECKING:
+    from pacesetter.config import Config
+    from pacesetter.training.trainer import Trainer
+
+SAMPLE = 20.0  # seconds of updates that an estimate rests on
+LONG = 24 * 3600.0  # seconds from which a run's length is worth a line
+WIDE = 256  # units of a layer that a CPU updates quickly
+
+
+def within_warmup(config: "Config") -> str | None:
+    """One line on a run that would never learn, as its budget ends within the warm-up."""
+    hyper: Any = config.hyper
+    steps, warmup = budget(config.settings()), getattr(hyper, "warmup", 0)
+    if steps > warmup or getattr(hyper, "warmup_updates", False):
+        return None
+    less = max(steps // 10, 1)
+    return (
+        f"warmup: all {steps:,} steps are within the warm-up of {warmup:,} random ones, so nothing "
+        f"is learned; give more --steps, or less warm-up, such as --warmup {less}"
+    )
+
+
+class Slowness:
+    """Says once that a run would take more than a day, by the speed of its first updates."""
+
+    def __init__(self, trainer: "Trainer") -> None:
+        self._trainer = trainer
+        self._seen = trainer.progress.updates
+        self._calls, self._mark = 0, (0, 0.0)
+        self._over = not hasattr(trainer.config.hyper, "updates_per_step")  # on-policy ones wait
+
+    def look(self, now: float) -> str | None:
+        """The line, when it is due; `now` in seconds of any clock."""
+        updates = self._trainer.progress.updates
+        if self._over or updates == self._seen:
+            return None
+        self._seen, self._calls = updates, self._calls + 1
+        if self._calls <= 2:  # the first calls compile
+            self._mark = updates, now
+            return None
+        made, seconds = updates - self._mark[0], now - self._mark[1]
+        if seconds < SAMPLE:
+            return None
+        self._over = True
+        left = self._left() * seconds / made
+        limit = self._trainer.config.run.time or inf
+        return self._line(made / seconds, left) if min(left, limit) > LONG else None
+
+    def _left(self) -> float:
+        """Critic updates that the budget still asks for."""
+        hyper: Any = self._trainer.config.hyper
+        steps = self._trainer.budget - max(self._trainer.progress.step, hyper.warmup)
+        return steps * hyper.updates_per_step
+
+    def _line(self, speed: float, seconds: float) -> str:
+        days = timedelta(seconds=seconds) / timedelta(days=1)
+        return (
+            f"at {speed:.2g} updates per second this run takes about {days:,.1f} days on this "
+            f"machine; {_remedy(self._trainer.config)}; Ctrl-C saves"
+        )
+
+
+def _remedy(config: "Config") -> str:
+    """What to change, the largest saving first."""
+    from pacesetter.config import presets
+
+    small = f"{config.run.algorithm}-small"
+    ways = [f"train {small} instead"] if small in presets() and config.run.name != small else []
+    for name in ("critic_hidden", "hidden"):
+        widths = getattr(config.hyper, name, ())
+        if any(width > WIDE for width in widths):
+            ways.append(f"give --{name.replace('_', '-')} {' '.join([str(WIDE)] * len(widths))}")
+    return ", or ".join([*ways, "fewer --steps", "a limit such as --time 8h"])

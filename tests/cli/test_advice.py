@@ -1,0 +1,83 @@
+"""What a newcomer is told before hours are spent: a budget within the warm-up, a run of days."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pacesetter.cli.advice import Slowness, within_warmup
+from pacesetter.cli.main import main
+from pacesetter.cli.progress import View
+from pacesetter.config import resolve
+
+TASK = "Pendulum-v1"
+FLAGS = ["--eval-every", "100", "--eval-episodes", "1"]
+
+
+def test_a_budget_within_the_warmup_is_said_before_it_starts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "td3", TASK, "--steps", "100", "--runs", str(tmp_path), *FLAGS]) == 0
+    first = capsys.readouterr().err.splitlines()[0]
+    assert "all 100 steps are within the warm-up of 25,000" in first
+    assert "--warmup 10" in first
+
+
+@pytest.mark.parametrize(
+    "settings", [{"steps": 26_000}, {"steps": 500, "warmup": 100}, {"warmup_updates": True}]
+)
+def test_a_budget_that_learns_is_no_matter(settings: dict[str, Any]) -> None:
+    assert within_warmup(resolve("td3", TASK, {"steps": 1_000} | settings)) is None
+
+
+def test_members_count_together() -> None:
+    """As many steps per member as the warm-up is long in all are enough for two."""
+    counted = {"steps": 13_000, "members": 2, "count": "member"}
+    assert within_warmup(resolve("td3", TASK, counted)) is None
+    assert within_warmup(resolve("td3", TASK, counted | {"count": "all"})) is not None
+
+
+class Clockwork:
+    """A trainer whose updates come at a speed."""
+
+    def __init__(self, name: str, speed: float, **settings: Any) -> None:
+        self.config = resolve(name, TASK, settings)
+        self.budget, self.speed = self.config.budget, speed
+        self.progress: Any = SimpleNamespace(step=5_000, updates=0)
+
+    def lines(self, seconds: int) -> list[str]:
+        slow, said = Slowness(self), []  # pyright: ignore
+        for now in range(seconds):
+            self.progress.updates = int(now * self.speed)
+            said.append(slow.look(float(now)))
+        return [line for line in said if line]
+
+
+def test_a_run_of_days_is_said_once() -> None:
+    """A million updates at 2 per second are 5.8 days; the small preset is named."""
+    (line,) = Clockwork("crossq", 2.0).lines(200)
+    assert "2 updates per second" in line
+    assert "about 5.8 days" in line
+    assert "train crossq-small instead" in line
+    assert "--critic-hidden 256 256" in line
+
+
+def test_a_run_of_hours_is_not() -> None:
+    assert Clockwork("crossq", 100.0).lines(200) == []
+    assert Clockwork("crossq", 2.0, time="8h").lines(200) == []
+
+
+def test_the_view_names_the_phase() -> None:
+    trainer: Any = Clockwork("td3", 1.0, steps=30_000)
+    trainer.progress = SimpleNamespace(
+        step=100, next_evaluation=5_000, wall_seconds=0.0, ended=[[1, -7.5, 200]], best=None
+    )
+    view = View(trainer)
+    assert (view.phase, "ETA after the warm-up" in view.speed()) == ("warm-up", True)
+    assert view.returns() == "return - (best -)  in training -7.5"
+    trainer.progress.step = 26_000
+    trainer.progress.next_evaluation = 30_000
+    assert view.phase == "training"
+    trainer.progress.next_evaluation = 26_000
+    assert view.phase == "evaluating"
