@@ -450,9 +450,11 @@ def test_progress_goes_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split("  ")[0] for line in err.splitlines()] == [
         f"step {step} of 250" for step in (0, 100, 200, 250)
     ]
-    result, policy = out.splitlines()
+    result, policy, watch = out.splitlines()
     assert re.fullmatch(rf"{PROBE} td3 seed 0: 250 steps, return -?[\d.]+ at step 250", result)
-    assert Path(policy.removeprefix("policy: ")).is_file()
+    file = Path(policy.removeprefix("policy: "))
+    assert file.is_file()
+    assert watch == f"watch it: `pacesetter record {file.parent} -o walk.mp4`"
 
 
 def test_eval_of_a_run(command: Command) -> None:
