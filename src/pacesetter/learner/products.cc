@@ -16,8 +16,12 @@ namespace {
 
 namespace ffi = xla::ffi;
 
-constexpr int kWidth = 64;           // columns of a block
-constexpr double kShared = 4e6;      // operations below which one thread is quicker than two
+constexpr int kWidth = 64;       // columns of a block
+constexpr double kShared = 4e6;  // operations from which several threads are quicker than one
+
+struct alignas(64) Line {
+  float numbers[16];
+};
 
 // out (pair, m, n) = left (pair, m, k) right (pair, k, n), row by row. `left_t` has the left side
 // stored as (pair, k, m), `right_t` the right one as (pair, n, k).
@@ -25,8 +29,10 @@ struct Sizes {
   int m, n, k;
   bool left_t, right_t;
 
-  // libxsmm counts by columns, so the two sides change places.
+  // What makes a block of so many columns; null if there is none. libxsmm counts by columns, so
+  // the two sides change places.
   libxsmm_smmfunction kernel(int width) const {
+    if (width == 0 || width > n) return nullptr;
     const int right = right_t ? width : n, left = left_t ? m : k;
     const int flags = left_t ? LIBXSMM_GEMM_FLAG_TRANS_B : LIBXSMM_GEMM_FLAG_NONE;
     const int prefetch = LIBXSMM_GEMM_PREFETCH_NONE;
@@ -54,10 +60,10 @@ struct Work {
     const int width = std::min<int>(kWidth, n - static_cast<int>(at));
     const float* from = right + network * k * n;
     if (right_t) {
-      thread_local std::vector<float> turned;
-      turned.resize(std::max<size_t>(turned.size(), static_cast<size_t>(k) * kWidth));
+      thread_local std::vector<Line> turned;
+      turned.resize(std::max<size_t>(turned.size(), static_cast<size_t>(k) * kWidth / 16));
       libxsmm_otrans(turned.data(), from + at * k, sizeof(float), k, width, k, width);
-      from = turned.data();
+      from = turned.data()->numbers;
     } else {
       from += at;
     }
@@ -85,8 +91,8 @@ ffi::Future Product(ffi::ThreadPool pool, bool left_t, bool right_t, ffi::Buffer
   work->out = out->typed_data();
   work->blocks = (n + kWidth - 1) / kWidth;
   work->total = pair * work->blocks;
-  work->whole = n >= kWidth ? work->sizes.kernel(kWidth) : nullptr;
-  work->rest = n % kWidth ? work->sizes.kernel(n % kWidth) : nullptr;
+  work->whole = work->sizes.kernel(kWidth);
+  work->rest = work->sizes.kernel(n % kWidth);
   work->made = ffi::CountDownPromise(work->total);
   ffi::Future future(work->made);
   if (2.0 * pair * m * n * k >= kShared) {
@@ -110,7 +116,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(product, Product,
                                   .Arg<ffi::Buffer<ffi::F32>>()
                                   .Ret<ffi::Buffer<ffi::F32>>());
 
-// Whether libxsmm has a kernel for a product on this processor.
+// Whether libxsmm makes a product on this processor; asked before XLA is told to call the above.
 extern "C" bool fits(int m, int n, int k, bool left_t, bool right_t) {
   const Sizes sizes{m, n, k, left_t, right_t};
   return (n < kWidth || sizes.kernel(kWidth)) && (n % kWidth == 0 || sizes.kernel(n % kWidth));

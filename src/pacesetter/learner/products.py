@@ -1,63 +1,99 @@
-"""Matrix products of any function by libxsmm, a library that XLA then calls, in float32."""
+"""Float32 matrix products of a finished program by libxsmm, which XLA calls, where it is there.
+
+`products.cc` is built when pacesetter is installed (hatch_build.py).
+"""
 
 import ctypes
+import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import JaxprEqn
 from jax.extend.core.primitives import dot_general_p
 
+from pacesetter.errors import unknown
+from pacesetter.learner.backend import platform
 from pacesetter.learner.rewriting import rewritten
 
 P = ParamSpec("P")
 R = TypeVar("R")
-FILE = Path(__file__).with_name("libproducts.so")  # hatch_build.py makes it
+Way = Literal["libxsmm", "xla"]
+VARIABLE = "PACESETTER_PRODUCTS"
+FILE = Path(__file__).with_name("libproducts.so")
 TARGET = "pacesetter_product"
-LEAST = 16  # sides below it are for XLA: no vector of numbers fits into them
+LEAST = 16  # products with a side below it stay XLA's
+ABSENT = f"products: libxsmm is not built in, so XLA makes them; see docs/products.md or {VARIABLE}"
+
+
+def way(precision: str = "f32") -> Way:
+    """Who makes the float32 products of updates; it decides their last bits."""
+    return "libxsmm" if _wanted(precision) and library() else "xla"
+
+
+def of(hyper: Any) -> Way:
+    """The same for a run's settings."""
+    return way(getattr(hyper, "precision", "f32"))
+
+
+def notes(hyper: Any) -> list[str]:
+    """What a person should know of it: a line if libxsmm would be used and is absent."""
+    wanted = _wanted(getattr(hyper, "precision", "f32"))
+    return [ABSENT] if wanted and not library() else []
+
+
+def _wanted(precision: str) -> bool:
+    value = os.environ.get(VARIABLE) or "auto"
+    if value not in ("auto", "xla"):
+        raise unknown(VARIABLE, value, ("auto", "xla"))
+    return value == "auto" and precision == "f32" and platform() == "cpu"
 
 
 def libxsmm_products(function: Callable[P, R]) -> Callable[P, R]:
-    """`function` whose float32 products of matrices, one or several, libxsmm makes."""
-    return rewritten(function, _foreign)
+    """`function` whose float32 products of matrices, or of stacks of them, libxsmm makes."""
+    return rewritten(function, _by_libxsmm)
 
 
 @cache
 def library() -> Any:
-    """The compiled products, known to XLA; None where they have not been built."""
+    """The compiled products, made known to XLA; None where there are none that it can use."""
     try:
         found = ctypes.CDLL(str(FILE))
-    except OSError:
+        found.fits.restype = ctypes.c_bool
+        jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(found.product), platform="cpu")
+    except (OSError, AttributeError, jax.errors.JaxRuntimeError):
         return None
-    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(found.product), platform="cpu")
     return found
 
 
-def _foreign(equation: JaxprEqn, inputs: list[Any]) -> Any:
+def _by_libxsmm(equation: JaxprEqn, inputs: list[Any]) -> Any:
     if equation.primitive is not dot_general_p:
         return None
     left, right = inputs
-    if left.dtype != jnp.float32 or right.dtype != jnp.float32 or left.ndim != right.ndim:
-        return None
     (left_sum, right_sum), (left_shared, right_shared) = equation.params["dimension_numbers"]
     shared = tuple(range(left.ndim - 2))
-    if tuple(left_shared) != shared or tuple(right_shared) != shared or len(left_sum) != 1:
+    of_matrices = left.ndim == right.ndim >= 2 and len(left_sum) == 1
+    if not of_matrices or not shared == tuple(left_shared) == tuple(right_shared):
         return None
     left_t, right_t = left_sum[0] == len(shared), right_sum[0] == len(shared) + 1
-    if left_t:  # of weights: JAX makes it transposed and turns it then; these two turns cancel
-        if right_t:
-            return None
-        found = _product(right, left, True, False)
-        return None if found is None else jnp.swapaxes(found, -1, -2)
-    return _product(left, right, False, right_t)
+    if not left_t:
+        return _product(left, right, right_t=right_t)
+    if right_t:
+        return None
+    # A gradient of weights, which JAX makes transposed and then turns: the two turns cancel.
+    found = _product(right, left, left_t=True)
+    return None if found is None else jnp.swapaxes(found, -1, -2)
 
 
-def _product(left: Any, right: Any, left_t: bool, right_t: bool) -> Any:
+def _product(left: Any, right: Any, *, left_t: bool = False, right_t: bool = False) -> Any:
+    """(..., m, k) times (..., k, n), each as it is or stored transposed; None if it is XLA's."""
     m, k = left.shape[-2:][:: -1 if left_t else 1]
     n = right.shape[-2 if right_t else -1]
+    if left.dtype != jnp.float32 or right.dtype != jnp.float32 or not left.size:
+        return None
     if min(m, n, k) < LEAST or not library().fits(m, n, k, left_t, right_t):
         return None
     shape = jax.ShapeDtypeStruct((*left.shape[:-2], m, n), jnp.float32)
