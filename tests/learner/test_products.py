@@ -15,10 +15,10 @@ from stopping import stop_at
 
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
-from pacesetter.config import settle
+from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.learner import products
-from pacesetter.learner.compiled import Population
+from pacesetter.learner.compiled import CompiledLearner
 from pacesetter.learner.products import libxsmm_products, way
 from pacesetter.networks import batch_renorm, mlp
 from pacesetter.training.trainer import Trainer
@@ -69,18 +69,15 @@ def calls_in(program: Any) -> int:
     return len(own) + sum(map(calls_in, inner))
 
 
-def population_of(name: str, precision: str) -> tuple[Population, str]:
-    """The compiled functions of a learner, and the program of its update."""
-    hyper = settle(name, "HalfCheetah-v5").hyper
+def update_of(name: str, precision: str) -> str:
+    """The program of a learner's update, as XLA gets it."""
+    learner = algorithms.find(name).build(Spec(17, 6), resolve(name, "HalfCheetah-v5").hyper)
     layout = Layout(Spec(17, 6))
-    population = Population(
-        algorithms.find(name).build(layout.spec, hyper), layout, 0, False, precision
-    )
-    rows = np.zeros((population.algorithm.updates_per_call, 64, layout.width), np.float32)
+    compiled = CompiledLearner(learner, layout, 0, False, precision)
+    rows = np.zeros((learner.updates_per_call, 64, layout.width), np.float32)
     still = np.zeros(17, np.float32), np.ones(17, np.float32)
-    (state,), key = population.init(1, same=False), np.zeros(2, np.uint32)
-    update: Any = vars(population)["_update"]
-    return population, update.lower(state, rows, None, still, {}, key).as_text()
+    (state,), key = compiled.init(1, same=False), np.zeros(2, np.uint32)
+    return compiled._update.lower(state, rows, None, still, {}, {}, key).as_text()
 
 
 def assert_close(found: Any, expected: Any) -> None:
@@ -176,29 +173,31 @@ print({hashlib.sha256(b"".join(a.tobytes() for a in product(x, w))).hexdigest() 
 
 def test_who_makes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = "libxsmm" if products.library() else "xla"
-    assert way("cpu") == expected
-    assert way("gpu") == way("cpu", "bf16") == "xla"
+    assert way() == expected
+    assert way("bf16") == "xla"
     monkeypatch.setenv(products.VARIABLE, "xla")
-    assert way("cpu") == "xla"
-    assert products.notes("cpu") == []
+    assert way() == "xla"
+    assert products.notes(None) == []
     monkeypatch.setenv(products.VARIABLE, "yes")
     with pytest.raises(UsageError, match=rf"{products.VARIABLE}.*'yes'.*auto"):
-        way("cpu")
+        way()
+    monkeypatch.delenv(products.VARIABLE)
+    monkeypatch.setattr(products, "platform", lambda: "gpu")
+    assert way() == "xla"
+    assert products.notes(None) == []
 
 
 @built
 @pytest.mark.parametrize("precision", ["f32", "bf16"])
 def test_an_update_calls_it_unless_in_bfloat16(precision: str) -> None:
-    _, text = population_of("td3", precision)
+    text = update_of("td3", precision)
     assert (CALL in text) == (precision == "f32")
     assert ("bf16" in text) == (precision == "bf16")
 
 
 @pytest.mark.usefixtures("absent")
 def test_without_the_library_xla_makes_them_and_a_line_says_so(runs: Path) -> None:
-    population, text = population_of("td3", "f32")
-    assert population.products == "xla"
-    assert CALL not in text
+    assert CALL not in update_of("td3", "f32")
     trainer = Trainer("td3", "Hopper-v5", runs=runs, steps=20, eval_episodes=1)
     (note,) = trainer.notes
     assert "libxsmm" in note
@@ -231,5 +230,5 @@ def test_a_run_resumes_bit_for_bit_and_says_so_if_another_makes_them(
     assert "products by libxsmm, going on with xla" in note
     assert other.directory.record()["resumed"][0]["products"] == "xla"
     run_to_end(other)
-    actors = [jax.tree.leaves(trainer.ensemble.states[0].actor) for trainer in (whole, other)]
+    actors = [jax.tree.leaves(trainer.loop.learners.states[0].actor) for trainer in (whole, other)]
     assert any((x != y).any() for x, y in zip(*actors, strict=True))
