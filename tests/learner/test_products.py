@@ -38,8 +38,8 @@ SHAPES = (
 
 
 @pytest.fixture(autouse=True)
-def _auto(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(products.VARIABLE, raising=False)
+def _asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(products.VARIABLE, "libxsmm")
 
 
 @pytest.fixture
@@ -175,13 +175,14 @@ def test_who_makes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     expected = "libxsmm" if products.library() else "xla"
     assert way() == expected
     assert way("bf16") == "xla"
-    monkeypatch.setenv(products.VARIABLE, "xla")
-    assert way() == "xla"
-    assert products.notes(None) == []
+    for value in ("xla", ""):
+        monkeypatch.setenv(products.VARIABLE, value)
+        assert way() == "xla"
+        assert products.notes(None) == []
     monkeypatch.setenv(products.VARIABLE, "yes")
-    with pytest.raises(UsageError, match=rf"{products.VARIABLE}.*'yes'.*auto"):
+    with pytest.raises(UsageError, match=rf"{products.VARIABLE}.*'yes'.*libxsmm, xla"):
         way()
-    monkeypatch.delenv(products.VARIABLE)
+    monkeypatch.setenv(products.VARIABLE, "libxsmm")
     monkeypatch.setattr(products, "platform", lambda: "gpu")
     assert way() == "xla"
     assert products.notes(None) == []

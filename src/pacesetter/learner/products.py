@@ -1,6 +1,6 @@
-"""Float32 matrix products of a finished program by libxsmm, which XLA calls, where it is there.
+"""Float32 matrix products of a finished program by libxsmm, which XLA then calls, if asked for.
 
-`products.cc` is built when pacesetter is installed (hatch_build.py).
+`products.cc` is built when pacesetter is installed, where that is possible (hatch_build.py).
 """
 
 import ctypes
@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ VARIABLE = "PACESETTER_PRODUCTS"
 FILE = Path(__file__).with_name("libproducts.so")
 TARGET = "pacesetter_product"
 LEAST = 16  # products with a side below it stay XLA's
-ABSENT = f"products: libxsmm is not built in, so XLA makes them; see docs/products.md or {VARIABLE}"
+ABSENT = f"{VARIABLE}: libxsmm is not built in, so XLA makes all products; see docs/products.md"
 
 
 def way(precision: str = "f32") -> Way:
@@ -40,16 +40,16 @@ def of(hyper: Any) -> Way:
 
 
 def notes(hyper: Any) -> list[str]:
-    """What a person should know of it: a line if libxsmm would be used and is absent."""
+    """What a person should know of it: a line if libxsmm is asked for and absent."""
     wanted = _wanted(getattr(hyper, "precision", "f32"))
     return [ABSENT] if wanted and not library() else []
 
 
 def _wanted(precision: str) -> bool:
-    value = os.environ.get(VARIABLE) or "auto"
-    if value not in ("auto", "xla"):
-        raise unknown(VARIABLE, value, ("auto", "xla"))
-    return value == "auto" and precision == "f32" and platform() == "cpu"
+    value = os.environ.get(VARIABLE) or "xla"
+    if value not in get_args(Way):
+        raise unknown(VARIABLE, value, get_args(Way))
+    return value == "libxsmm" and precision == "f32" and platform() == "cpu"
 
 
 def libxsmm_products(function: Callable[P, R]) -> Callable[P, R]:
