@@ -1,6 +1,7 @@
 """Whether another library makes an update's matrix products quicker than XLA does.
 
     python benchmarks/products.py
+    python benchmarks/products.py --updates     whole updates, by pacesetter's own two ways
 
 The products are read out of the updates themselves. Each is timed alone, a few independent ones a
 call, and the best of many short repeats counts; the libraries take turns. XLA may take the sides of
@@ -31,15 +32,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ceiling import SPECS, TOGETHER, Product, flops, products, swapped, timed
+from ceiling import SPECS, TOGETHER, Product, flops, products, swapped, timed, whole
 from scipy.stats import gmean
 from tabulate import tabulate
 
 from pacesetter import algorithms
+from pacesetter.batch import Layout as Rows
 from pacesetter.config import resolve
-from pacesetter.learner.backend import compiler_options
 from pacesetter.learner.precision import SMALL
-from pacesetter.replay.buffer import Columns
+from pacesetter.learner.products import VARIABLE
+from pacesetter.learner.products import library as built_in
 
 NAMES = ("td3", "sac", "crossq-small")
 BATCHES = (64, 128, 256, 512)
@@ -216,14 +218,15 @@ def update_products(name: str, batch: int) -> Counter[Product]:
     config = resolve(name, "HalfCheetah-v5", {"batch_size": batch})
     spec = SPECS["HalfCheetah-v5"]
     learner = algorithms.find(config.run.algorithm).build(spec, config.hyper)
-    columns = Columns(*spec, len(learner.mask(np.random.default_rng(0))))
-    key, shape = jax.random.key(0), (learner.cycle, batch, columns.width)
+    rows = Rows(spec, len(learner.mask(np.random.default_rng(0))))
+    key, shape = jax.random.key(0), (learner.updates_per_call, batch, rows.width)
 
-    def update(state: Any, rows: Any) -> Any:
-        return learner.update(state, columns.unpack(rows, None), key)
+    def update(state: Any, packed: Any) -> Any:
+        minibatches = rows.unpack(packed)._replace(weight=jnp.ones(shape[:-1]))
+        return learner.update(state, minibatches, key)
 
-    rows = jax.ShapeDtypeStruct(shape, jnp.float32)
-    traced = jax.make_jaxpr(update)(jax.eval_shape(learner.init, key), rows)
+    packed = jax.ShapeDtypeStruct(shape, jnp.float32)
+    traced = jax.make_jaxpr(update)(jax.eval_shape(learner.init, key), packed)
     counts: Counter[Product] = Counter()
     for product, times in products(traced.jaxpr):
         left, right, (_, (shared, _)) = product
@@ -268,8 +271,8 @@ def error(results: Sequence[Any], works: Sequence[Work]) -> float:
 
 
 def xla(way: str, product: Product, works: Sequence[Work]) -> list[Call]:
-    """A program of XLA for each order of the sides, with the options of updates and this way's."""
-    options, pairs = (compiler_options() or {}) | WAYS[way], [(w.left, w.right) for w in works]
+    """A program of XLA for each order of the sides, with this way's options."""
+    options, pairs = WAYS[way], [(w.left, w.right) for w in works]
     other = [(right, left) for left, right in pairs]
     return [program(product, pairs, options), program(swapped(product), other, options)]
 
@@ -408,11 +411,36 @@ def rate(counts: Counter[Product], took: dict[Product, float]) -> float:
     return work / sum(took[product] * times for product, times in counts.items()) / 1e9
 
 
-def on_cores(cores: int, rounds: int) -> dict[str, Any]:
-    """What `measure` finds in a process of its own on so many cores."""
+def updates(rounds: int) -> list[list[Any]]:
+    """Name, batch, the most updates/s of either way, and the ratio of both and its median.
+
+    The two take turns in this process, each for a few hundredths of a second.
+    """
+    if not built_in():
+        raise SystemExit("products.py: libxsmm is not built in (docs/products.md)")
+    found: list[list[Any]] = []
+    for name, batch in itertools.product(NAMES, BATCHES[:-1]):
+        cycles: list[tuple[Callable[[], Any], int]] = []
+        for value in ("xla", "libxsmm"):
+            os.environ[VARIABLE] = value
+            call, _, made = whole(name, SPECS["HalfCheetah-v5"], 1, batch_size=batch)
+            timed(call, 3)
+            cycles.append((call, made))
+        rates = np.array(
+            [[made / timed(call, 16 // made) for call, made in cycles] for _ in range(rounds)]
+        )
+        xla, libxsmm = rates.max(axis=0)
+        found.append(
+            [name, batch, xla, libxsmm, libxsmm / xla, np.median(rates[:, 1] / rates[:, 0])]
+        )
+    return found
+
+
+def on_cores(cores: int, rounds: int, what: str = "--measure") -> Any:
+    """What `measure` or `updates` finds in a process of its own on so many cores."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(before)[-cores:])  # which the process inherits
-    words = [sys.executable, __file__, "--measure", "--rounds", str(rounds)]
+    words = [sys.executable, __file__, what, "--measure", "--rounds", str(rounds)]
     environment = {**os.environ, "NPROC": str(cores), "OMP_NUM_THREADS": str(cores)}
     environment["JAX_PLATFORMS"] = "cpu"
     done = subprocess.run(words, env=environment, stdout=subprocess.PIPE, text=True, check=True)
@@ -464,12 +492,28 @@ def main() -> None:
     """Print the table, then for each library whether it is worth its while."""
     parser = argparse.ArgumentParser(description="Time the products of updates.")
     parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("--updates", action="store_true", help="time whole updates, both ways")
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.measure:
-        json.dump(measure(chosen.rounds), sys.stdout)
+        json.dump((updates if chosen.updates else measure)(chosen.rounds), sys.stdout)
         return
     counts = [cores for cores in (1, 2) if cores <= len(os.sched_getaffinity(0))]
+    if chosen.updates:
+        rows_of = {cores: on_cores(cores, chosen.rounds, "--updates") for cores in counts}
+        lines = [[cores, *row] for cores, found in rows_of.items() for row in found]
+        headers = [
+            "cores",
+            "algorithm",
+            "batch",
+            "XLA",
+            "libxsmm",
+            "best over best",
+            "median ratio",
+        ]
+        shapes = ("", "", "", ".0f", ".0f", ".2f", ".2f")
+        print(tabulate(lines, headers, "github", floatfmt=shapes))
+        return
     every = {cores: on_cores(cores, chosen.rounds) for cores in counts}
     processor = subprocess.run("lscpu", capture_output=True, text=True, check=True).stdout
     print(*(line for line in processor.splitlines() if "Model" in line), sep="\n")

@@ -39,8 +39,11 @@ def costs(name: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("name", "megabytes"), [("td3", 36), ("sac", 52)])
-def test_an_update_computes_little_but_its_matrix_products(name: str, megabytes: float) -> None:
+def test_an_update_computes_little_but_its_matrix_products(
+    name: str, megabytes: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At most 3% of arithmetic beside them, and no array moved more often than now."""
+    monkeypatch.setenv("PACESETTER_PRODUCTS", "xla")  # it cannot count what libxsmm computes
     found = costs(name)
     assert WORK[name] <= found["flops"] <= 1.03 * WORK[name]
     assert found["bytes accessed"] <= megabytes * 1e6

@@ -133,6 +133,7 @@ def _describe(run: RunDirectory) -> list[str]:
         for row in evaluations[-SHOWN_EVALUATIONS:]
     ]
     made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
+    made.append(("products", record.get("products") or "xla"))
     return [
         f"{run.path}: {steps} steps, {state}",
         "",

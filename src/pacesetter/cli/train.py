@@ -74,10 +74,7 @@ def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
-    for note in trainer.notes:
-        print(f"pacesetter: {note}", file=sys.stderr)
-    return trainer, found.quiet
+    return Trainer.resume(directory.path, steps=found.steps, time=found.time), found.quiet
 
 
 def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
@@ -91,6 +88,8 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
     with stopping(lambda: [each.stop() for each in trainers]) as received:
         trainer, quiet = begin(words)
         trainers.append(trainer)
+        for note in trainer.notes:
+            print(f"pacesetter: {note}", file=sys.stderr)
         if received:
             trainer.stop()
         if not quiet and (line := within_warmup(trainer.config)):

@@ -23,6 +23,12 @@ def prepare(device: str) -> None:
         jax.config.update("jax_default_device", _device(device))
 
 
+def platform() -> str:
+    """Where updates run: cpu, gpu or tpu."""
+    device: Any = jax.config.values["jax_default_device"] or jax.devices()[0]
+    return device.platform
+
+
 def _device(kind: str) -> Any:
     try:
         return jax.devices(kind)[0]

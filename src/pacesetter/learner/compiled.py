@@ -21,6 +21,7 @@ from pacesetter.algorithms.contract import Array, Learner, State
 from pacesetter.batch import Layout
 from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
+from pacesetter.learner import products
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
 from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
@@ -62,7 +63,11 @@ class CompiledLearner:
         self._policy_params = jax.jit(learner.policy_params)
         self._fold = jax.jit(self._fold_keys)
         self._keys = lru_cache(maxsize=1024)(self._make_keys)
-        update = bfloat16_products(self._update_one) if precision == "bf16" else self._update_one
+        update = self._update_one
+        if precision == "bf16":
+            update = bfloat16_products(update)
+        elif products.way() == "libxsmm":
+            update = products.libxsmm_products(update)
         self._update = jax.jit(update, donate_argnums=0)
 
     def init(self, members: int, same: bool) -> list[State]:

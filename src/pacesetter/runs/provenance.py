@@ -1,4 +1,4 @@
-"""What a result needs to be repeated: command, versions, commit, machine, threads, backend."""
+"""What a result needs to be repeated: command, versions, commit, machine, threads, libraries."""
 
 import platform
 import shlex
@@ -15,8 +15,8 @@ from pacesetter.process import cores, threads
 PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 
 
-def provenance(backend: str | None) -> dict[str, Any]:
-    """Where this process runs and with what; `backend` is JAX's."""
+def provenance(backend: str | None, products: str | None = None) -> dict[str, Any]:
+    """Where this process runs and with what: JAX's backend, and who makes matrix products."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),
@@ -24,6 +24,7 @@ def provenance(backend: str | None) -> dict[str, Any]:
         "threads": threads(),
         "machine": f"{platform.machine()}, {len(cores())} cores",
         "backend": backend,
+        "products": products,
     }
 
 

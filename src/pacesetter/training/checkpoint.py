@@ -9,6 +9,7 @@ from pacesetter import storage
 from pacesetter.config import Config
 from pacesetter.ensemble.loop import Loop
 from pacesetter.errors import TrainingError, UsageError
+from pacesetter.learner import products
 from pacesetter.learner.tree_arrays import below
 from pacesetter.process import threads
 from pacesetter.replay.buffer import Replay
@@ -35,6 +36,7 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
     table = {
         "schema": SCHEMA,
         "threads": threads(),
+        "products": products.of(config.hyper),
         "run": _identity(config),
         **{name: part.table() for name, part in loop.parts().items()},
         "log": directory.sync_log(),
@@ -81,6 +83,12 @@ def _restore(
     if table["threads"] != threads() and loop.progress.step < loop.budget:
         notes.append(
             f"made with {table['threads']} threads, going on with {threads()}: "
+            "results will differ in their last bits"
+        )
+    made_by, now_by = table.get("products", "xla"), products.of(config.hyper)
+    if made_by != now_by and loop.progress.step < loop.budget:
+        notes.append(
+            f"made with products by {made_by}, going on with {now_by}: "
             "results will differ in their last bits"
         )
 

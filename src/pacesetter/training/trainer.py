@@ -13,6 +13,7 @@ from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError, blame
 from pacesetter.evaluation import Evaluation, rollouts
+from pacesetter.learner import products
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
@@ -47,14 +48,15 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         prepare(self.config.run.device)
         self._begin()
-        self.directory.create(self.config, jax.default_backend())
+        made_by = products.of(self.config.hyper)
+        self.directory.create(self.config, jax.default_backend(), made_by)
         try:
             self.loop.open_replays(self.directory.state_file.parent)
             checkpoint.save(self.loop, self.config, self.directory)
         except BaseException:
             self.directory.remove()
             raise
-        self.notes: list[str] = []
+        self.notes = products.notes(self.config.hyper)
 
     @classmethod
     def resume(
@@ -84,7 +86,8 @@ class Trainer:
             if self.progress.step > self.budget:
                 made = f"{self.progress.step:,}"
                 raise UsageError(f"steps: the run has made {made} already; give more")
-            self.directory.note_resume(self.config, self.progress.step, jax.default_backend())
+            backend, made_by = jax.default_backend(), products.of(self.config.hyper)
+            self.directory.note_resume(self.config, self.progress.step, backend, made_by)
         except BaseException:
             self.directory.unlock()
             raise
