@@ -145,7 +145,7 @@ def test_no_action_leaves_a_box_of_float64() -> None:
 
 
 def test_an_episode_without_end_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pacesetter.envs.MAX_EPISODE", 300)
+    monkeypatch.setattr("pacesetter.envs.environment.MAX_EPISODE", 300)
     env = world("broken_envs:Endless-v0")
     with pytest.raises(TrainingError, match=r"not ended after 300 steps; .*max_episode_steps"):
         rollouts(lambda observation: np.zeros(2, np.float32), env, 1)

@@ -1,46 +1,19 @@
-"""Gymnasium tasks in float32 with actions in [-1, 1]: checked, seeded, and resumed exactly."""
+"""One env and its running episode: float32, actions in [-1, 1], seeded and resumed exactly."""
 
-import difflib
-import logging
-import re
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
 
-from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.envs.spaces import action_bounds
+from pacesetter.envs.tasks import make
+from pacesetter.errors import TrainingError, UsageError
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.types import Floats
 
 MAX_EPISODE = 100_000  # steps; an episode that never ends would hang every evaluation
 MAX_REWARD = float(np.finfo(np.float32).max)  # the replay keeps rewards in float32
-
-
-class PaddedAnt(gymnasium.ObservationWrapper[Any, Any, Any]):
-    """Ant as the -v2 papers had it: 27 numbers and 84 contact forces that were always zero."""
-
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
-        self.observation_space = Box(-np.inf, np.inf, (111,), np.float64)
-
-    def observation(self, observation: Any) -> Any:
-        return np.concatenate([observation, np.zeros(84)])
-
-
-def make_ant111(**kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Entry point of `pacesetter/Ant111-v4`."""
-    return PaddedAnt(make_quietly("Ant-v4", kwargs).unwrapped)
-
-
-gymnasium.register(
-    "pacesetter/Ant111-v4",
-    entry_point="pacesetter.envs:make_ant111",
-    max_episode_steps=1000,
-)
 
 
 class Step(NamedTuple):
@@ -65,80 +38,6 @@ class Snapshot(NamedTuple):
     observation: Floats
 
 
-def known() -> list[str]:
-    """Ids that `make` accepts without a module, without those whose entry point only raises."""
-
-    def works(entry_point: object) -> bool:
-        return not getattr(entry_point, "__name__", "").startswith("_raise_")
-
-    return [name for name, spec in gymnasium.registry.items() if works(spec.entry_point)]
-
-
-def _log_warning(message: str) -> None:
-    if "settotalmass" not in message:  # Gymnasium's own models; nothing a user can do
-        logging.getLogger(__name__).warning("MuJoCo: %s", message)
-
-
-def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """gymnasium.make without the warnings that v4 is old and its models use an old keyword."""
-    import mujoco
-
-    # Without a handler MuJoCo writes MUJOCO_LOG.TXT into the working directory.
-    mujoco.set_mju_user_warning(_log_warning)  # pyright: ignore[reportAttributeAccessIssue]
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*The environment .* is out of date.*")
-        return gymnasium.make(name, disable_env_checker=True, **kwargs)
-
-
-def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
-    """Make a task by its Gymnasium id. Raises UsageError if the id or the task is wrong."""
-    plain = name.split(":")[-1]
-    if not re.search(r"-v\d+$", plain, re.IGNORECASE) and name not in known():
-        versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
-        hint = f"; write {' or '.join(versions)}" if versions else "; such as HalfCheetah-v5"
-        raise UsageError(f"env: '{name}' has no version{hint}")
-    if ":" not in name and name not in known():
-        raise unknown("env", name, _near(name))
-    try:
-        env = make_quietly(name, kwargs or {})
-    except Exception as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UsageError(f"env: cannot make '{name}': {reason}") from None
-    for what in ("observation", "action"):
-        _check_space(f"env: {name}: {what} space", getattr(env, f"{what}_space", None))
-    if not np.issubdtype(env.action_space.dtype, np.floating):
-        raise UsageError(
-            f"env: {name}: action space: must be of float32 or float64, got {env.action_space}"
-        )
-    if not np.isfinite(np.concatenate(_bounds(env))).all():
-        raise UsageError(
-            f"env: {name}: action space: its bounds must be finite, got {env.action_space}"
-        )
-    return env
-
-
-def _near(name: str) -> list[str]:
-    return difflib.get_close_matches(name, known(), n=3, cutoff=0.4) or known()
-
-
-def _check_space(what: str, space: Any) -> None:
-    if not isinstance(space, Box):
-        hint = " (wrap it in FlattenObservation)" if "observation" in what else ""
-        raise UsageError(f"{what}: must be a Box, got {type(space).__name__}{hint}")
-    if 0 in space.shape:
-        raise UsageError(f"{what}: must hold at least one number, its shape is {space.shape}")
-
-
-def _bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:
-    """The action bounds in float32, rounded inwards so that no action leaves a float64 box."""
-    space: Any = env.action_space
-    with np.errstate(over="ignore"):  # bounds beyond float32 become infinite and are refused
-        low, high = (bound.astype(np.float32).ravel() for bound in (space.low, space.high))
-    low = np.where(low < space.low.ravel(), np.nextafter(low, np.float32(np.inf)), low)
-    high = np.where(high > space.high.ravel(), np.nextafter(high, np.float32(-np.inf)), high)
-    return low, high
-
-
 class Environment:
     """One env and its running episode.
 
@@ -152,7 +51,7 @@ class Environment:
         self.env = make(name, kwargs)
         self.name, self.seed, self.stream, self.index = name, seed, stream, index
         space: Any = self.env.action_space
-        self.low, self.high = _bounds(self.env)
+        self.low, self.high = action_bounds(self.env)
         self.action_shape: tuple[int, ...] = space.shape
         self.action_type = space.dtype
         self.observation_shape: tuple[int, ...] = self.env.observation_space.shape or ()

@@ -1,0 +1,14 @@
+"""The env border: Gymnasium tasks in float32 with actions in [-1, 1], checked and seeded."""
+
+import gymnasium
+
+from pacesetter.envs.environment import Environment, Snapshot, Step
+from pacesetter.envs.tasks import known, make
+
+__all__ = ["Environment", "Snapshot", "Step", "known", "make"]
+
+gymnasium.register(
+    "pacesetter/Ant111-v4",
+    entry_point="pacesetter.envs.ant:make_ant111",
+    max_episode_steps=1000,
+)
