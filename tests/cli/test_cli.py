@@ -210,6 +210,45 @@ def test_list_and_show_runs(command: Command) -> None:
         assert re.search(rf"^{step} +{re.escape(f'{mean:.1f}')} ", shown, re.MULTILINE)
 
 
+def test_list_alone_names_everything(command: Command) -> None:
+    """The hint of a refusal, `see pacesetter list`, leads to every kind with its names."""
+    text = command("list")
+    for kind in (*LISTS, "champions"):
+        assert re.search(rf"^{kind} +\S", text, re.MULTILINE), kind
+    for name in ("multi-td3", "HalfCheetah-v5", "top_half", "crossq-small", "pilot", "champion:"):
+        assert name in text, name
+    assert max(map(len, text.splitlines())) <= 88
+
+
+def test_lists_as_json(command: Command) -> None:
+    run = trained(command, "td3", "--steps", 120)
+    (row,) = json.loads(command("list", "runs", "--json"))
+    assert row["return"] == run.rows("eval")[-1]["mean"]
+    assert {key: row[key] for key in ("name", "step", "budget", "state")} == {
+        "name": str(run.path), "step": 120, "budget": 120, "state": "finished"
+    }  # fmt: skip
+    every = json.loads(command("list", "--json"))
+    assert {*every} == {*LISTS, "champions"}
+    assert all(each["name"] for rows in every.values() for each in rows)
+
+
+def test_show_says_what_it_leaves_out(command: Command) -> None:
+    run = trained(command, "td3", "--steps", 160, "--eval-every", 20)
+    steps = [row["step"] for row in run.rows("eval")]
+    assert len(steps) == 9
+    text = command("show", run.path)
+    assert "4 earlier evaluations left out; --all shows every one" in text
+    assert "\n0 " not in text
+    assert re.search(r"^time +-$", text, re.MULTILINE), "a setting without a value shows a dash"
+    text = command("show", run.path, "--all")
+    assert "left out" not in text
+    assert all(re.search(rf"^{step} ", text, re.MULTILINE) for step in steps)
+    told = json.loads(command("show", run.path, "--json"))
+    assert [row["step"] for row in told["evaluations"]] == steps
+    assert told["settings"] == run.settings()
+    assert told["ledger"]["updates"] == run.rows()[-1]["updates"]
+
+
 # Settings.
 
 COUNTS = {"5000": 5_000, "300k": 300_000, "1M": 1_000_000, "1e6": 1_000_000, "1.5k": 1_500,
@@ -450,11 +489,13 @@ def test_progress_goes_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     assert [line.split("  ")[0] for line in err.splitlines()] == [
         f"step {step} of 250" for step in (0, 100, 200, 250)
     ]
-    result, policy, watch = out.splitlines()
+    result, policy, name, watch = out.splitlines()
     assert re.fullmatch(rf"{PROBE} td3 seed 0: 250 steps, return -?[\d.]+ at step 250", result)
     file = Path(policy.removeprefix("policy: "))
     assert file.is_file()
-    assert watch == f"watch it: `pacesetter record {file.parent} -o walk.mp4`"
+    called = Path(*file.parent.parts[-3:])
+    assert name == f"run: {called}, a name for show, eval, record, resume and compare"
+    assert watch == f"watch it: `pacesetter record {called} -o walk.mp4`"
 
 
 def test_eval_of_a_run(command: Command) -> None:

@@ -9,6 +9,7 @@ from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
 
+RUNS = "runs"
 _POSITIONAL = {"algorithm", "env", "env_kwargs"}
 _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
@@ -36,8 +37,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_runs(self) -> None:
         """`--runs`, the folder of all runs."""
-        about = "folder of runs (default runs)"
-        self.add_argument("--runs", default="runs", metavar="DIR", help=about)
+        about = f"folder of runs (default {RUNS})"
+        self.add_argument("--runs", default=RUNS, metavar="DIR", help=about)
 
     def add_quiet(self) -> None:
         """`--quiet`, for verbs that show progress."""

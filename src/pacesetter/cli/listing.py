@@ -1,99 +1,106 @@
-"""The verbs `list` and `show`: what there is, as lines."""
+"""The verb `list`: what there is, as lines or as JSON."""
 
 import inspect
+import json
+from collections.abc import Callable
+from textwrap import fill
 from typing import Any
 
 from tabulate import tabulate
 
 from pacesetter.cli.flags import parser
+from pacesetter.cli.show import evaluations, state
 from pacesetter.errors import UsageError, unknown
-from pacesetter.runs import Row, RunDirectory, find, find_all
-from pacesetter.settings.budget import budget, is_spent
+from pacesetter.runs import Row, find_all
 
-SHOWN_EVALUATIONS = 5
+WIDTH = 88  # columns of a paragraph
 
 
 def list_(words: list[str]) -> int:
-    """List algorithms, envs, rules, presets, suites or runs."""
-    command = parser("list", "List algorithms, envs, rules, presets, suites or runs.")
-    nouns = [*LISTS, "runs"]
-    command.add_argument("noun", metavar="|".join(nouns), help="what to list")
+    """List algorithms, envs, rules, presets, suites, champions or runs."""
+    command = parser("list", "List what there is: everything by name, or one kind in full.")
+    kinds = [*LISTS, "runs"]
+    about = "what to list in full (default everything, by name)"
+    command.add_argument("kind", nargs="?", metavar="|".join(kinds), help=about)
+    command.add_argument("--json", action="store_true", help="print a list of objects as JSON")
     command.add_runs()
     found = command.parse(words)
-    if found.noun not in nouns:
-        raise unknown("list", found.noun, nouns)
-    for line in runs(found.runs) if found.noun == "runs" else LISTS[found.noun]():
-        print(line)
+    if found.kind is not None and found.kind not in kinds:
+        raise unknown("list", found.kind, kinds)
+    lists = LISTS | {"runs": lambda: runs(found.runs)}
+    if found.json:
+        chosen = [found.kind] if found.kind else kinds
+        tables = {kind: lists[kind]() for kind in chosen}
+        print(json.dumps(tables[found.kind] if found.kind else tables))
+    elif found.kind is None:
+        print(_everything(lists))
+    else:
+        print(_full(found.kind, lists[found.kind](), found.runs))
     return 0
 
 
-def show(words: list[str]) -> int:
-    """Show a run: how far it is, how it scores, what it spent, its settings."""
-    command = parser("show", "Show a run: how far it is, how it scores, what it spent.")
-    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
-    command.add_runs()
-    found = command.parse(words)
-    for line in describe(find(found.run, found.runs)):
-        print(line)
-    return 0
-
-
-def algorithms() -> list[str]:
+def algorithms() -> list[Row]:
     """Algorithms and what each is, with the ensemble form of each."""
     from pacesetter.algorithms import TABLE, names, plugins, single_member
 
-    rows = [(name, entry.help) for name, entry in TABLE.items()]
-    rows += [(name, target) for name, target in plugins().items()]
+    rows = {name: entry.help for name, entry in TABLE.items()} | plugins()
     several = [name for name in names() if not single_member(name)]
-    rows += [(f"multi-{name}", f"{name} with --members 2 --rule best") for name in several]
-    return _table(rows)
+    rows |= {f"multi-{name}": f"{name} with --members 2 --rule best" for name in several}
+    return [{"name": name, "help": about} for name, about in rows.items()]
 
 
-def envs() -> list[str]:
-    """Gymnasium's walkers by id, and what else `train` takes."""
+def envs() -> list[Row]:
+    """Gymnasium's walkers by id."""
     from pacesetter.envs import known
 
     walkers = ("HalfCheetah", "Walker2d", "Ant", "Humanoid", "Hopper", "Swimmer")
     found = [name for name in known() if name.split("-")[0] in walkers or "pacesetter/" in name]
-    return [*found, "any other Gymnasium id with Box observations and actions, or module:Id-v0"]
+    return [{"name": name} for name in found]
 
 
-def rules() -> list[str]:
+def rules() -> list[Row]:
     """Selection rules."""
     from pacesetter.ensemble.rules import RULES
 
-    return _table(
-        [(name, (inspect.getdoc(rule) or "").split("\n")[0]) for name, rule in RULES.items()]
-    )
+    return [
+        {"name": name, "help": (inspect.getdoc(rule) or "").split("\n")[0]}
+        for name, rule in RULES.items()
+    ]
 
 
-def presets() -> list[str]:
+def presets() -> list[Row]:
     """Presets and where their values come from."""
     from pacesetter.config import presets
 
-    return _table([(name, table["help"], table["source"]) for name, table in presets().items()])
+    return [
+        {"name": name, "help": table["help"], "source": table["source"]}
+        for name, table in presets().items()
+    ]
 
 
-def suites() -> list[str]:
+def suites() -> list[Row]:
     """Suites that come with the package: how many runs each has, and what it is for."""
     from pacesetter.study.bench.suite import count, load, shipped
 
     found = [load(name) for name in shipped()]
-    return _table([(suite.name, f"{count(suite)} runs", suite.help) for suite in found])
+    return [
+        {"name": suite.name, "runs": f"{count(suite)} runs", "help": suite.help} for suite in found
+    ]
 
 
-def champions() -> list[str]:
+def champions() -> list[Row]:
     """Policies that come with the package."""
     from pacesetter.cli.policies import CHAMPION, champions
     from pacesetter.policy import load
 
     found = [(name, load(file).about) for name, file in champions().items()]
-    return _table(
-        [(f"{CHAMPION}{name}", about["env"], f"step {about['step']:,}") for name, about in found]
-    )
+    return [
+        {"name": f"{CHAMPION}{name}", "env": about["env"], "step": about["step"]}
+        for name, about in found
+    ]
 
 
-LISTS = {
+LISTS: dict[str, Callable[[], list[Row]]] = {
     "algorithms": algorithms,
     "envs": envs,
     "rules": rules,
@@ -101,75 +108,56 @@ LISTS = {
     "suites": suites,
     "champions": champions,
 }
+HINTS = {"envs": "any other Gymnasium id with Box observations and actions, or module:Id-v0"}
 
 
-def runs(folder: str) -> list[str]:
+def runs(folder: str) -> list[Row]:
     """Runs below a folder: how far each is and how its champion scores."""
-    rows: list[tuple[Any, ...]] = []
+    rows: list[Row] = []
     for run in find_all(folder):
+        row: Row = {"name": str(run.path)}
         try:
-            rows.append((run.path, *_state(run)))
+            means = [each["mean"] for each in evaluations(run)]
+            rows.append(row | state(run) | {"return": means[-1] if means else None})
         except (UsageError, KeyError, TypeError) as error:
-            rows.append((run.path, "-", f"damaged or foreign: {error}", "-"))
-    if not rows:
-        return [f"no runs below {folder}"]
-    return _table(rows, ("run", "steps", "state", "return"))
+            rows.append(row | {"state": f"damaged or foreign: {error}"})
+    return rows
 
 
-def describe(run: RunDirectory) -> list[str]:
-    """One run: where it stands, its last evaluations, what it spent, its settings and versions."""
-    try:
-        return _describe(run)
-    except (KeyError, TypeError) as error:
-        raise UsageError(f"{run.path}: damaged or foreign: {error}") from None
-
-
-def _describe(run: RunDirectory) -> list[str]:
-    record, rows = run.record(), run.rows()
-    steps, state, _ = _state(run)
-    evaluations = [row for row in rows if row["kind"] == "eval"]
-    recent = [
-        (f"{row['step']:,}", f"{row['mean']:.1f}", f"{row['std']:.1f}", len(row["returns"]))
-        for row in evaluations[-SHOWN_EVALUATIONS:]
+def _everything(lists: dict[str, Callable[[], list[Row]]]) -> str:
+    """The names of every kind, a paragraph each."""
+    paragraphs = [
+        fill(
+            ", ".join(row["name"] for row in make()) or "none yet",
+            WIDTH,
+            initial_indent=f"{kind:12}",
+            subsequent_indent=" " * 12,
+            break_on_hyphens=False,
+        )
+        for kind, make in lists.items()
     ]
-    made = [(key, record[key]) for key in ("command", "commit", "threads", "machine")]
-    made.append(("products", record.get("products") or "xla"))
-    return [
-        f"{run.path}: {steps} steps, {state}",
-        "",
-        *_table(recent, ("step", "return", "std", "episodes")),
-        "",
-        *_table(_ledger(rows)),
-        "",
-        *_table(list(record["settings"].items())),
-        "",
-        *_table([*made, *record["versions"].items()]),
-    ]
+    return "\n".join([*paragraphs, "", "`pacesetter list KIND` tells more about each."])
 
 
-def _ledger(rows: list[Row]) -> list[tuple[str, Any]]:
-    """What a run has spent, by the last row of its log."""
-    last = rows[-1] if rows else {}
-    counts = ("member_steps", "selection_steps", "updates", "transitions", "episodes")
-    times = ("cpu_seconds", "wall_seconds")
-    return [
-        *((key, last[key]) for key in counts if key in last),
-        ("selections", sum(row["kind"] == "select" for row in rows)),
-        *((key, f"{last[key]:.0f}") for key in times if key in last),
-    ]
+def _full(kind: str, rows: list[Row], folder: str) -> str:
+    if kind == "runs":
+        if not rows:
+            return f"no runs below {folder}"
+        cells = [_run_cells(row) for row in rows]
+        return _table(cells, ("run", "steps", "state", "return"))
+    lines = _table([[_words(value) for value in row.values()] for row in rows])
+    return "\n".join([lines, HINTS[kind]] if kind in HINTS else [lines])
 
 
-def _state(run: RunDirectory) -> tuple[str, str, str]:
-    """How far a run is, its state, and its last evaluation."""
-    settings, rows = run.settings(), run.rows()
-    last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
-    over = is_spent(settings, last["step"], last["wall_seconds"])
-    state = "running" if run.in_use() else "finished" if over else "stopped"
-    means = [row["mean"] for row in rows if row["kind"] == "eval"]
-    steps = f"{last['step']:,} of {budget(settings):,}"
-    return steps, state, f"{means[-1]:.1f}" if means else "-"
+def _run_cells(row: Row) -> list[str]:
+    mean = row.get("return")
+    steps = f"{row['step']:,} of {row['budget']:,}" if "step" in row else "-"
+    return [row["name"], steps, row["state"], "-" if mean is None else f"{mean:.1f}"]
 
 
-def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> list[str]:
-    text = tabulate(rows, headers=headers, tablefmt="plain", disable_numparse=True)
-    return text.split("\n") if text else []
+def _words(value: Any) -> str:
+    return f"step {value:,}" if isinstance(value, int) else str(value)
+
+
+def _table(rows: list[list[str]], headers: tuple[str, ...] = ()) -> str:
+    return tabulate(rows, headers=headers, tablefmt="plain", disable_numparse=True)

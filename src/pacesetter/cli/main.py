@@ -7,9 +7,10 @@ from collections.abc import Callable
 from pacesetter.cli.bench import bench
 from pacesetter.cli.compare import compare
 from pacesetter.cli.evaluate import evaluate
-from pacesetter.cli.listing import list_, show
+from pacesetter.cli.listing import list_
 from pacesetter.cli.pictures import poster, record, watch
 from pacesetter.cli.share import export, fetch, push
+from pacesetter.cli.show import show
 from pacesetter.cli.train import resume, train
 from pacesetter.cli.tune import tune
 from pacesetter.errors import TrainingError, UsageError, unknown

@@ -2,9 +2,10 @@
 
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pacesetter.cli.flags import add_settings, algorithm_and_env, parser, split_env_kwargs
+from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 
@@ -77,6 +78,11 @@ def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
     return Trainer.resume(directory.path, steps=found.steps, time=found.time), found.quiet
 
 
+def name_of(path: Path) -> str:
+    """What a person may type for a run: without the folder where runs are looked for anyway."""
+    return str(path.relative_to(RUNS)) if path.is_relative_to(RUNS) else str(path)
+
+
 def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
     """Train to the end or to a signal, and say where the result is."""
     from pacesetter.cli.advice import within_warmup
@@ -104,6 +110,8 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
     if received and not trainer.finished:
         print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
         return exit_code(received)
+    called = name_of(trainer.directory.path)
     print(f"policy: {trainer.directory.policy_file}")
-    print(f"watch it: `pacesetter record {trainer.directory.path} -o walk.mp4`")
+    print(f"run: {called}, a name for show, eval, record, resume and compare")
+    print(f"watch it: `pacesetter record {called} -o walk.mp4`")
     return 0

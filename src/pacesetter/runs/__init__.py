@@ -6,8 +6,17 @@ from pacesetter.runs.directory import (
     SCHEMA,
     Row,
     RunDirectory,
-    find,
-    find_all,
 )
+from pacesetter.runs.finding import find, find_all, find_group, find_matching
 
-__all__ = ["FREE_PER_SEED", "IN_USE", "SCHEMA", "Row", "RunDirectory", "find", "find_all"]
+__all__ = [
+    "FREE_PER_SEED",
+    "IN_USE",
+    "SCHEMA",
+    "Row",
+    "RunDirectory",
+    "find",
+    "find_all",
+    "find_group",
+    "find_matching",
+]

@@ -1,4 +1,4 @@
-"""The run directory: its files, its config, its log, its lock, and how to find one."""
+"""The run directory: its files, its config, its log and its lock."""
 
 import fcntl
 import json
@@ -6,7 +6,6 @@ import os
 import platform
 import re
 import shutil
-from collections.abc import Iterator
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -220,24 +219,3 @@ class RunDirectory:
         except OSError:
             return True
         return False
-
-
-def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
-    """All runs below a folder, in order."""
-    for config in sorted(Path(runs).rglob("config.json")):
-        yield RunDirectory(config.parent)
-
-
-def find(name: str, runs: str | Path = "runs") -> RunDirectory:
-    """A run by its path, or by an end of its path that only one run has."""
-    if (Path(name) / "config.json").exists():
-        return RunDirectory(Path(name))
-    parts = Path(name).parts
-    found = [run for run in find_all(runs) if run.path.parts[-len(parts) :] == parts]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise UsageError(f"run: '{name}' matches {', '.join(str(run.path) for run in found[:4])}")
-    known = [str(run.path) for run in find_all(runs)]
-    near = f"; there are {', '.join(known[:4])}" if known else f"; no runs below {runs}"
-    raise UsageError(f"run: '{name}' not found{near}")

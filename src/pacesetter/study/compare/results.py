@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter.errors import UsageError
-from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all
+from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all, find_group, find_matching
 from pacesetter.settings.budget import budget, is_spent, steps_per_count
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.stats import Array
@@ -209,18 +209,12 @@ def _sources(word: str, runs: Path) -> Iterator[tuple[str, Any, Path | None]]:
 def _directories(word: str, runs: Path) -> list[RunDirectory]:
     if below := list(find_all(word) if Path(word).is_dir() else []):
         return below
-    if any(mark in word for mark in "*?["):
-        below = [run for path in sorted(glob(word)) for run in find_all(path)]
-        below += [run for run in find_all(runs) if _fits(run.path, word)]
-        if not below:
-            raise UsageError(f"run: '{word}' matches no run here or below {runs}")
+    if not any(mark in word for mark in "*?["):
+        return find_group(word, runs) or [find(word, runs)]
+    below = [run for path in sorted(glob(word)) for run in find_all(path)]
+    if below := below + find_matching(word, runs):
         return below
-    groups = [run for run in find_all(runs) if run.path.parent.match(word)]
-    return groups or [find(word, runs)]
-
-
-def _fits(path: Path, pattern: str) -> bool:
-    return path.match(pattern) or path.parent.match(pattern)
+    raise UsageError(f"run: '{word}' matches no run here or below {runs}")
 
 
 def _lines(path: Path) -> Iterator[tuple[str, Any, Path | None]]:

@@ -1,0 +1,74 @@
+"""Runs by the names that people type."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePath
+
+from pacesetter.errors import UsageError
+from pacesetter.runs.directory import RunDirectory
+
+SHOWN = 4  # runs that a refusal names
+
+
+def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
+    """All runs below a folder, in order."""
+    for config in sorted(Path(runs).rglob("config.json")):
+        yield RunDirectory(config.parent)
+
+
+def find(name: str, runs: str | Path = "runs") -> RunDirectory:
+    """A run by its path, or by an end of its path or of its name that only one run has."""
+    if (Path(name) / "config.json").exists():
+        return RunDirectory(Path(name))
+    parts = _plain(name).parts
+    found = _called(runs, lambda path: path.parts[-len(parts) :] == parts)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UsageError(f"run: '{name}' matches {_few(found)}")
+    known = list(find_all(runs))
+    near = f"; there are {_few(known)}" if known else f"; no runs below {runs}"
+    raise UsageError(f"run: '{name}' not found{near}")
+
+
+def find_group(name: str, runs: str | Path = "runs") -> list[RunDirectory]:
+    """All seeds of what is called so, such as HalfCheetah-v5/td3 or multi-td3."""
+    pattern = str(_plain(name))
+    return _called(runs, lambda path: path.parent.match(pattern))
+
+
+def find_matching(pattern: str, runs: str | Path = "runs") -> list[RunDirectory]:
+    """All runs that a pattern fits, with the seed or without it."""
+    pattern = str(_plain(pattern))
+    return _called(runs, lambda path: path.match(pattern) or path.parent.match(pattern))
+
+
+def _called(runs: str | Path, fits: Callable[[PurePath], bool]) -> list[RunDirectory]:
+    """Runs whose folder fits, or else those of which another spelling does."""
+    every = list(find_all(runs))
+    own = [run for run in every if fits(run.path)]
+    return own or [run for run in every if any(map(fits, _spellings(run)))]
+
+
+def _spellings(run: RunDirectory) -> Iterator[PurePath]:
+    """The run's folder with its task as it was typed, and as it is without its module.
+
+    The folder of `module:Id-v0` is module-Id-v0, and that of `group/Id-v0` group-Id-v0.
+    """
+    try:
+        env = run.settings()["env"]
+    except UsageError:  # damaged, which is for its own commands to say
+        return
+    *above, _, name, seed = ("", "", *run.path.parts)
+    for typed in (_plain(env), PurePath(env.split(":")[-1]), PurePath(PurePath(env).name)):
+        yield PurePath(*above, typed, name, seed)
+
+
+def _plain(name: str) -> PurePath:
+    """As folders are named, which hold no colon."""
+    if not name.strip():
+        raise UsageError("run: its name is empty; `pacesetter list runs` shows them all")
+    return PurePath(name.replace(":", "-"))
+
+
+def _few(runs: list[RunDirectory]) -> str:
+    return ", ".join(str(run.path) for run in runs[:SHOWN])
