@@ -177,7 +177,7 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "eval of a missing run": (["eval", "nothing"], ["nothing", "not found"]),
     "eval of a missing file": (["eval", "no.safetensors"], ["no.safetensors", "no such file"]),
     "list of what": (["list", "algoritms"], ["algoritms", "algorithms"]),
-    "list of nothing": (["list"], ["algorithms", "envs"]),
+    "list of what there is not": (["list", "seeds"], ["'seeds'", "algorithms", "envs"]),
 }
 
 # Settings files, as text, and what the line must say.

@@ -1,6 +1,5 @@
 """Gymnasium tasks by their id: found, made, and refused where no learner could use them."""
 
-import difflib
 import logging
 import re
 import warnings
@@ -45,7 +44,7 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
         hint = f"; write {' or '.join(versions)}" if versions else "; such as HalfCheetah-v5"
         raise UsageError(f"env: '{name}' has no version{hint}")
     if ":" not in name and name not in known():
-        raise unknown("env", name, _near(name))
+        raise unknown("env", name, known(), see="pacesetter list envs")
     try:
         env = make_quietly(name, kwargs or {})
     except Exception as error:
@@ -53,7 +52,3 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
         raise UsageError(f"env: cannot make '{name}': {reason}") from None
     check_spaces(name, env)
     return env
-
-
-def _near(name: str) -> list[str]:
-    return difflib.get_close_matches(name, known(), n=3, cutoff=0.4) or known()
