@@ -8,11 +8,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
-from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import (
     ROWS_A_TICK,
@@ -24,13 +23,8 @@ from pacesetter.settings import (
     Settings,
     budget,
 )
+from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import build, fields_of
-
-
-def _check_rule(value: str) -> str:
-    if value not in RULES:
-        raise unknown("rule", value, RULES)
-    return value
 
 
 def _check_json(value: dict[str, Any]) -> dict[str, Any]:
@@ -41,18 +35,9 @@ def _check_json(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _check_selects_on_eval(value: int, info: ValidationInfo) -> int:
-    if value != SELECT_EVERY and info.data.get("select_on") == "train":
-        raise ValueError("applies to --select-on eval, not to train")
-    return value
-
-
-SELECT_EVERY = 5_000  # env steps
-
-
 @dataclass(frozen=True, kw_only=True, config=STRICT)
-class Run:
-    """What to train: the task, the budget, the members, and how the best member is selected."""
+class Task:
+    """What to train, where, and for how long."""
 
     algorithm: str = Field(description="algorithm; see `pacesetter list algorithms`")
     env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
@@ -65,38 +50,12 @@ class Run:
         None, gt=0, description="stop after this wall time, such as 2h; default no limit"
     )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
-    members: int = Field(
-        1, ge=1, le=1000, description="ensemble members: learners that share the replay"
-    )
-    rule: Annotated[str, AfterValidator(_check_rule)] = Field(
-        "best", description="selection rule: who is copied to whom; see `pacesetter list rules`"
-    )
-    select_on: Literal["train", "eval"] = Field(
-        "train", description="select by returns of training episodes, or of extra noise-free ones"
-    )
-    select_every: Annotated[Count, AfterValidator(_check_selects_on_eval)] = Field(
-        SELECT_EVERY, ge=1, description="env steps between selections, with --select-on eval"
-    )
-    select_window: int = Field(1, ge=1, description="episodes per member behind each selection")
-    select_after: Count | None = Field(
-        None, ge=0, description="env steps before the first selection; default --warmup"
-    )
-    count_selection_steps: bool = Field(
-        True, description="count the steps of extra selection episodes towards --steps"
-    )
-    copy: Literal["full", "weights", "actor"] = Field(
-        "full", description="copy networks and optimiser state, only networks, or only the actor"
-    )
-    same_init: bool = Field(False, description="start all members from the same weights")
-    count: Literal["all", "member"] = Field(
-        "all", description="count --steps and intervals over all members, or per member"
-    )
-    wait: bool = Field(
-        True, description="a member whose episode has ended waits until all have ended"
-    )
-    replay_scope: Literal["shared", "member"] = Field(
-        "shared", description="one shared replay, or one per member"
-    )
+
+
+@dataclass(frozen=True, kw_only=True, config=STRICT)
+class Run(Ensemble, Task):
+    """All settings of a run but those of its algorithm."""
+
     eval_every: Count = Field(5_000, ge=1, description="env steps between evaluations")
     eval_episodes: int = Field(10, ge=1, description="episodes per evaluation")
     checkpoint_every: Duration = Field(
@@ -105,13 +64,6 @@ class Run:
     device: Literal["auto", "cpu", "gpu", "tpu"] = Field(
         "auto", description="device that runs the updates"
     )
-
-
-# Settings of members that share a replay, which a learner on rollouts has not.
-ENSEMBLE_SETTINGS = (
-    *("members", "rule", "copy", "same_init", "count", "wait", "replay_scope"),
-    *("select_on", "select_every", "select_window", "select_after", "count_selection_steps"),
-)
 
 
 class Config(NamedTuple):
@@ -242,8 +194,8 @@ def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
 
 
 def _refuse_ensemble(run: Run) -> None:
-    for name in ENSEMBLE_SETTINGS:
-        value, default = getattr(run, name), fields_of(Run)[name].default
+    for name, info in fields_of(Ensemble).items():
+        value, default = getattr(run, name), info.default
         if value != default:
             raise UsageError(
                 f"{name}: {run.algorithm} trains one member, on its own rollouts; "

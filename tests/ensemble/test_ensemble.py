@@ -221,7 +221,9 @@ def test_average_is_the_mean_of_the_better_half(states: Any) -> None:
     the best, for everyone; `weights` and `actor` take their part of it and leave the rest.
     """
     states = [jax.tree.map(lambda x: x.round() if x.dtype.kind == "f" else x, s) for s in states]
-    parents, weights, _ = choose("average", np.array([4.0, 1.0, 6.0]), np.random.default_rng())
+    parents, weights, _ = choose(
+        "average", np.array([[4.0], [1.0], [6.0]]), np.random.default_rng()
+    )
     assert parents.tolist() == [2, 2, 2]
     expected = jax.tree.map(
         lambda one, best: (one + best) / 2 if best.dtype.kind == "f" else best, states[0], states[2]
@@ -262,6 +264,38 @@ def test_average_in_a_run(runs: Path) -> None:
     for state in after:
         for part in NETWORKS:
             assert same(getattr(state, part), getattr(mean, part))
+
+
+def test_rescue_copies_only_who_has_fallen(runs: Path) -> None:
+    """Windows of five episodes: nobody, then member 0 alone, from the best, member 1."""
+    returns = ([9] * 5 + [1, 2, 1, 2, 1], [10] * 5 + [11, 10, 11, 10, 11], [8] * 10)
+    trainer = start(runs, returns, members=3, rule="rescue", steps=300)
+    apply, held = trainer.loop.apply, list[Any]()
+
+    def watched(selection: Selection) -> None:
+        before = jax.device_get(trainer.loop.learners.states)
+        apply(selection)
+        held.append((before, jax.device_get(trainer.loop.learners.states)))
+
+    trainer.loop.apply = watched
+    rows = select_rows(trainer)
+    assert [row["step"] for row in rows] == [150, 300]
+    assert [row["parents"] for row in rows] == [[0, 1, 2], [1, 1, 2]]
+    assert [row["champion"] for row in rows] == [1, 1]
+    assert same(*held[0])
+    before, after = held[1]
+    assert same(after, [before[1], before[1], before[2]])
+
+
+@pytest.mark.parametrize("window", [2, 3])
+def test_rescue_looks_at_the_given_window(window: int, runs: Path) -> None:
+    trainer = start(runs, rule="rescue", select_window=window, steps=60 * window, **IDLE)
+    assert [len(row["returns"][0]) for row in select_rows(trainer)] == [window] * 3
+
+
+def test_rescue_needs_two_episodes(runs: Path) -> None:
+    with pytest.raises(UsageError, match=r"^select_window: .*at least 2 episodes, got 1$"):
+        start(runs, rule="rescue", select_window=1)
 
 
 # What a rule may change besides.

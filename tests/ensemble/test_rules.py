@@ -17,21 +17,27 @@ DISTINCT = st.lists(st.integers(-50, 50), min_size=1, max_size=9, unique=True).m
 SEEDS = st.integers(0, 2**32)
 
 
+def window(returns: Any) -> Any:
+    """Two like episodes of each member, so that `rescue` has a spread, which is none."""
+    return np.stack([returns, returns], axis=1)
+
+
 def parents_of(rule: str, returns: Any, seed: int = 0) -> list[int]:
-    return choose(rule, returns, np.random.default_rng(seed)).parents.tolist()
+    return choose(rule, window(returns), np.random.default_rng(seed)).parents.tolist()
 
 
 @pytest.mark.parametrize("rule", RULES)
 @given(returns=RETURNS | TIED, seed=SEEDS)
 def test_parents_are_members_and_returns_stay(rule: str, returns: Any, seed: int) -> None:
     """One parent a member, each a member, and the returns are not written to."""
-    before = returns.copy()
-    parents = choose(rule, returns, np.random.default_rng(seed)).parents
+    episodes = window(returns)
+    before = episodes.copy()
+    parents = choose(rule, episodes, np.random.default_rng(seed)).parents
     assert parents.shape == returns.shape
     assert np.issubdtype(parents.dtype, np.integer)
     assert parents.min() >= 0
     assert parents.max() < len(returns)
-    np.testing.assert_array_equal(returns, before)
+    np.testing.assert_array_equal(episodes, before)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -63,7 +69,7 @@ def test_random_is_blind_and_one_for_all(returns: Any, others: st.DataObject, se
 def test_random_draws_every_member_equally() -> None:
     """4000 draws among 4: each count within 5 standard errors of 1000."""
     rng = np.random.default_rng(0)
-    drawn = [int(RULES["random"](np.arange(4.0), rng)[0]) for _ in range(4000)]
+    drawn = [int(RULES["random"](window(np.arange(4.0)), rng)[0]) for _ in range(4000)]
     assert np.all(np.abs(np.bincount(drawn, minlength=4) - 1000) < 5 * (4000 * 3 / 16) ** 0.5)
 
 
@@ -94,7 +100,9 @@ def test_tournament_is_won_by_the_better_of_two(returns: Any, seed: int) -> None
 def test_tournament_favours_the_better_by_known_odds() -> None:
     """Among 3, the best wins 5 of 9 places, the next 3, the worst 1; 5 standard errors."""
     rng = np.random.default_rng(0)
-    places = np.concatenate([RULES["tournament"](np.array([1.0, 3, 2]), rng) for _ in range(3000)])
+    places = np.concatenate(
+        [RULES["tournament"](window(np.array([1.0, 3, 2])), rng) for _ in range(3000)]
+    )
     for k, odds in ((1, 5 / 9), (2, 3 / 9), (0, 1 / 9)):
         assert abs(np.mean(places == k) - odds) < 5 * (odds * (1 - odds) / 9000) ** 0.5
 
@@ -109,7 +117,7 @@ def test_renaming_members_renames_parents(rule: str, returns: Any, order: st.Dat
     assert [names[parent] for parent in renamed] == [parents[name] for name in names]
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "rescue"])
 @given(returns=DISTINCT, shift=st.integers(-1000, 1000), scale=st.sampled_from([0.5, 1, 64]))
 def test_only_the_order_of_returns_counts(rule: str, returns: Any, shift: int, scale: Any) -> None:
     assert parents_of(rule, returns, 5) == parents_of(rule, scale * returns + shift, 5)
@@ -119,13 +127,59 @@ def test_only_the_order_of_returns_counts(rule: str, returns: Any, shift: int, s
 def test_average_weights_the_better_half_alike(returns: Any) -> None:
     """Everyone's row: 1 / half for the half that `top_half` keeps, else 0; the best is parent."""
     count, half = len(returns), -(-len(returns) // 2)
-    parents, weights, scales = choose("average", returns, np.random.default_rng(0))
+    parents, weights, scales = choose("average", window(returns), np.random.default_rng(0))
     assert weights is not None
     assert scales is None
     kept = np.flatnonzero(
-        choose("top_half", returns, np.random.default_rng(0)).parents == np.arange(count)
+        choose("top_half", window(returns), np.random.default_rng(0)).parents == np.arange(count)
     )
     assert parents.tolist() == parents_of("best", returns)
     for row in weights:
         assert np.flatnonzero(row).tolist() == kept.tolist()
         assert set(row[kept]) == {1 / half}
+
+
+@pytest.mark.parametrize("rule", [rule for rule in RULES if rule not in ("random", "rescue")])
+@given(returns=DISTINCT, order=st.data())
+def test_means_of_the_window_decide(rule: str, returns: Any, order: st.DataObject) -> None:
+    """Episodes that differ by 1 around each mean choose as the means do."""
+    episodes = returns[:, None] + np.array([-1.0, 0, 1])
+    assert choose(rule, episodes, np.random.default_rng(3)).parents.tolist() == parents_of(
+        rule, returns, 3
+    )
+
+
+# Rescue.
+
+STEADY = np.array([-1.0, 1, 0, -1, 1])  # variance 1, so a difference has an error of sqrt(2 / 5)
+
+
+@pytest.mark.parametrize(
+    ("means", "parents"),
+    [
+        ([100, 61, 59], [0, 1, 0]),
+        ([59, 100, 100], [1, 1, 2]),
+        ([-100, -139, -141], [0, 1, 0]),
+        ([10, 3, -500], [0, 0, 0]),
+        ([1, 0.5, 0.1], [0, 1, 2]),  # below 60%, but within two errors, 1.26
+        ([1, -0.2, -0.3], [0, 1, 0]),
+        ([0, -1.2, -1.3], [0, 1, 0]),
+    ],
+)
+def test_rescue_takes_who_lies_far_below(means: list[float], parents: list[int]) -> None:
+    """Below 60% of the best, or 40% of its size below it where it is negative, and two errors."""
+    returns = np.array(means)[:, None] + STEADY
+    assert choose("rescue", returns, np.random.default_rng(0)).parents.tolist() == parents
+
+
+def test_rescue_leaves_who_only_swings() -> None:
+    """A mean of 51 against 100 is chance with an error of 28, and none without."""
+    returns = np.array([[100.0] * 5, [0, 120, 0, 120, 15]])
+    assert choose("rescue", returns, np.random.default_rng(0)).parents.tolist() == [0, 1]
+    returns[1] = 51
+    assert choose("rescue", returns, np.random.default_rng(0)).parents.tolist() == [0, 0]
+
+
+@given(returns=RETURNS, factor=st.sampled_from([0.25, 2, 64]))
+def test_rescue_does_not_depend_on_the_unit_of_reward(returns: Any, factor: float) -> None:
+    assert parents_of("rescue", returns) == parents_of("rescue", factor * returns)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
+from pacesetter.settings.validation import fields_of
 
 if TYPE_CHECKING:
     from pacesetter.training.trainer import Trainer
@@ -43,8 +44,9 @@ def _new_trainer(words: list[str]) -> tuple["Trainer", bool]:
 def _add_settings(command: Any, algorithm: str, env: str) -> None:
     """All flags of `train ALGO ENV`, with the defaults of that algorithm on that task."""
     from pacesetter import algorithms
-    from pacesetter.config import ENSEMBLE_SETTINGS, Run, preset_layers, resolve
+    from pacesetter.config import Run, preset_layers, resolve
     from pacesetter.settings import OnPolicy
+    from pacesetter.settings.ensemble import Ensemble
 
     base, _ = preset_layers(algorithm, env)
     hyper = algorithms.find(base).Hyper
@@ -55,7 +57,7 @@ def _add_settings(command: Any, algorithm: str, env: str) -> None:
     command.add_argument("--config", metavar="FILE", help="read settings from a .toml or .json")
     command.add_runs()
     command.add_quiet()
-    hidden = ENSEMBLE_SETTINGS if issubclass(hyper, OnPolicy) else ()
+    hidden = fields_of(Ensemble) if issubclass(hyper, OnPolicy) else ()
     add_settings(command, "settings of the run", Run, defaults, hidden)
     add_settings(command, f"settings of {base}", hyper, defaults)
 

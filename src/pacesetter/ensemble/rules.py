@@ -1,4 +1,4 @@
-"""Who starts again from whom: a rule maps the members' returns (K,) to a choice."""
+"""Who starts again from whom: a rule maps the members' returns (K, episodes) to a choice."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 Returns = NDArray[np.float64]
 Parents = NDArray[np.int64]
+
+RESCUE_SHARE = 0.4  # of the best mean return
+RESCUE_ERRORS = 2.0
 
 
 class Choice(NamedTuple):
@@ -32,8 +35,8 @@ def none(returns: Returns, rng: np.random.Generator) -> Parents:
 
 
 def best(returns: Returns, rng: np.random.Generator) -> Parents:
-    """All start again from the largest return, ties to the lowest index (Multi-TD3, III-B)."""
-    return np.full(len(returns), np.argmax(returns))
+    """All start again from the largest mean return, ties to the lowest index (Multi-TD3, III-B)."""
+    return np.full(len(returns), np.argmax(returns.mean(axis=1)))
 
 
 def random(returns: Returns, rng: np.random.Generator) -> Parents:
@@ -43,7 +46,7 @@ def random(returns: Returns, rng: np.random.Generator) -> Parents:
 
 def top_half(returns: Returns, rng: np.random.Generator) -> Parents:
     """The better half stays; each of the others starts again from one of it, best first."""
-    order = np.argsort(-returns, kind="stable")
+    order = np.argsort(-returns.mean(axis=1), kind="stable")
     half = (len(returns) + 1) // 2
     parents = np.arange(len(returns))
     parents[order[half:]] = order[: len(returns) - half]
@@ -52,17 +55,33 @@ def top_half(returns: Returns, rng: np.random.Generator) -> Parents:
 
 def tournament(returns: Returns, rng: np.random.Generator) -> Parents:
     """Each place goes to the better of two members drawn for it, ties to the lowest index."""
-    pairs = np.sort(rng.integers(len(returns), size=(len(returns), 2)), axis=1)
-    return np.where(returns[pairs[:, 1]] > returns[pairs[:, 0]], pairs[:, 1], pairs[:, 0])
+    means = returns.mean(axis=1)
+    pairs = np.sort(rng.integers(len(means), size=(len(means), 2)), axis=1)
+    return np.where(means[pairs[:, 1]] > means[pairs[:, 0]], pairs[:, 1], pairs[:, 0])
 
 
 def average(returns: Returns, rng: np.random.Generator) -> Choice:
     """All start again from the mean of the better half's networks."""
     count = len(returns)
-    better = np.argsort(-returns, kind="stable")[: (count + 1) // 2]
+    better = np.argsort(-returns.mean(axis=1), kind="stable")[: (count + 1) // 2]
     weights = np.zeros((count, count))
     weights[:, better] = 1 / len(better)
     return Choice(np.full(count, better[0]), weights)
+
+
+def rescue(returns: Returns, rng: np.random.Generator) -> Parents:
+    """Only a member far below the best starts again from it: below 60% and two standard errors.
+
+    "Below 60%" is a gap of more than 40% of the best mean return's size, whatever its sign: below
+    60 where the best has 100, below -140 where it has -100. The standard error is that of the
+    difference of two means, from each one's own episodes (Welch), of which there must be two.
+    """
+    episodes = returns.shape[1]
+    means, variances = returns.mean(axis=1), returns.var(axis=1, ddof=1) / episodes
+    top = np.argmax(means)
+    gap, error = means[top] - means, np.sqrt(variances + variances[top])
+    fallen = (gap > RESCUE_SHARE * abs(means[top])) & (gap > RESCUE_ERRORS * error)
+    return np.where(fallen, top, np.arange(len(returns)))
 
 
 RULES: dict[str, Rule] = {
@@ -72,6 +91,7 @@ RULES: dict[str, Rule] = {
     "top_half": top_half,
     "tournament": tournament,
     "average": average,
+    "rescue": rescue,
 }
 
 

@@ -64,7 +64,7 @@ class Selector:
 
     def on_training(self, progress: Progress) -> Selection | None:
         """Select on the training episodes since the last selection, once each member has enough."""
-        window = self.config.run.select_window
+        window = self.config.run.window
         if min(len(returns) for returns in self.returns) < window:
             return None
         returns = np.array([each[-window:] for each in self.returns])
@@ -95,17 +95,17 @@ class Selector:
         run = self.config.run
         if self.trial_env is None:
             self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
-        first, counted = self.selections * run.select_window, run.count_selection_steps
+        first, counted = self.selections * run.window, run.count_selection_steps
         limit = self.budget - progress.step if counted else inf
         with blame(k, progress.step):
-            trial = rollouts(policy.act, self.trial_env, run.select_window, first, limit=limit)
+            trial = rollouts(policy.act, self.trial_env, run.window, first, limit=limit)
         progress.selection_steps += sum(trial.lengths)
         progress.free_steps += 0 if counted else sum(trial.lengths)
         return trial.returns
 
     def _select(self, returns: Returns, champion: int, paired: bool) -> Selection:
         means, rule = returns.mean(axis=1), self.config.run.rule
-        choice = choose(rule, means, self.stream)
+        choice = choose(rule, returns, self.stream)
         if rule != "none":
             champion = find_champion(means, choice.parents)
         self.selections += 1
