@@ -1,13 +1,16 @@
-"""NPROC is read once: what is used, what is recorded and what is said agree."""
+"""NPROC is read once, and signals end the process with their codes from its first moments on."""
 
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
-from pacesetter.process import cores, fix_threads, threads
+from pacesetter.process import CODES, cores, exit_code, fix_threads, stopping, threads
 from pacesetter.runs.provenance import provenance
 
 
@@ -45,3 +48,73 @@ def test_an_unset_number_is_one_thread_per_core(monkeypatch: pytest.MonkeyPatch)
     assert threads() == 3
     fix_threads(2)  # a resumed run's own
     assert (os.environ["NPROC"], threads()) == ("2", 2)
+
+
+EARLY = """
+import os, sys
+
+module, number = sys.argv[1:]
+
+class Early:
+    def find_spec(self, name, *rest):
+        if name == module:
+            os.kill(os.getpid(), int(number))
+
+sys.meta_path.insert(0, Early())
+from pacesetter.__main__ import main
+sys.argv[1:] = ["list", "rules"]
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", CODES)
+@pytest.mark.parametrize("module", ["pacesetter.cli.main", "pydantic"])
+def test_signal_while_the_command_is_imported(number: int, module: str) -> None:
+    """It ends at once, without a word."""
+    words = [sys.executable, "-c", EARLY, module, str(int(number))]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=10)
+    assert (done.returncode, done.stdout, done.stderr) == (CODES[number], "", "")
+
+
+INSIDE = """
+import os, sys
+from pacesetter.__main__ import main
+from pacesetter.cli import main as command
+
+def verb(words):
+    os.kill(os.getpid(), int(words[0]))
+
+command.VERBS["verb"] = verb
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_signal_to_a_verb_that_saves_nothing(number: int) -> None:
+    words = [sys.executable, "-c", INSIDE, "verb", str(int(number))]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (CODES[number], "", "")
+
+
+def test_a_hangup_that_is_ignored_stays_ignored() -> None:
+    """As `nohup` does it; the other signals are taken."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stopping(lambda: None) as received:
+            signal.raise_signal(signal.SIGHUP)
+            assert received == []
+            signal.raise_signal(signal.SIGTERM)
+            assert received == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("number", CODES)
+def test_the_first_signal_asks_for_the_end(number: int) -> None:
+    before = signal.getsignal(number)
+    with stopping(lambda: asked.append(number)) as received:
+        asked: list[int] = []
+        signal.raise_signal(number)
+        assert asked == received == [number]
+        assert exit_code(received) == CODES[number]
+    assert signal.getsignal(number) == before

@@ -1,7 +1,24 @@
-"""`python -m pacesetter` is the command."""
+"""The command, from its first instruction to its exit code; it imports what is heavy last."""
 
+import os
 import sys
 
-from pacesetter.cli.main import main
+from pacesetter.process import interrupt, leave, on_signals
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the command that the process was started with. Returns its exit code."""
+    on_signals(leave)
+    from pacesetter.cli.main import main as command
+
+    on_signals(interrupt)
+    try:
+        code = command()
+    except SystemExit as end:  # argparse after --help
+        code = int(end.code or 0)
+    on_signals(lambda number, frame: os._exit(code))  # the work is done and its end is said
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,13 +8,23 @@ MAX_LENGTH = 500  # characters
 
 
 class _OneLine(Exception):  # noqa: N818
+    code = 1  # with which the command ends
+
     def __init__(self, message: str) -> None:
         text = " ".join(message.split())
         super().__init__(text if len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}...")
 
 
 class UsageError(_OneLine):
-    """Bad input: an unknown name, a value out of range, a damaged file. Exit code 2."""
+    """Bad input: an unknown name, a value out of range, a damaged file."""
+
+    code = 2
+
+
+class InUseError(UsageError):
+    """A run, or another file, that another process holds: to be tried again later."""
+
+    code = 75  # EX_TEMPFAIL of sysexits.h
 
 
 class TrainingError(_OneLine):

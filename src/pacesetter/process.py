@@ -5,8 +5,22 @@ import signal
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 from pacesetter.errors import UsageError
+
+# The exit code of a process that a signal ends; SIGUSR1 is a scheduler's warning of its SIGTERM.
+CODES: dict[int, int] = {
+    signal.SIGINT: 130,
+    signal.SIGTERM: 143,
+    signal.SIGHUP: 129,
+    signal.SIGUSR1: 143,
+}
+Handler = Callable[[int, FrameType | None], None]
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal that ends a command which has nothing to save; its argument is the signal."""
 
 
 def cores() -> list[int]:
@@ -35,9 +49,33 @@ def fix_threads(count: int | None = None) -> None:
     os.environ["NPROC"] = str(count or threads())
 
 
+def leave(number: int, frame: FrameType | None) -> None:
+    """End at once and without a word: nothing has begun."""
+    os._exit(CODES[number])
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """End by an exception, so that files and helpers are closed on the way out."""
+    raise Interrupted(number)
+
+
+def on_signals(handler: Handler) -> None:
+    """Let this handler have every signal that asks for the end."""
+    _install(dict.fromkeys(CODES, handler))
+
+
+def _install(handlers: dict[int, Any]) -> dict[int, Any]:
+    """Install handlers; what was there before. A hangup that `nohup` ignores stays ignored."""
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        handlers = {number: each for number, each in handlers.items() if number != signal.SIGHUP}
+    return {number: signal.signal(number, each) for number, each in handlers.items()}
+
+
 @contextmanager
-def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
-    """Let the first signal call `stop`, for a clean end, and the second end the process.
+def stopping(
+    stop: Callable[[], object], abandon: Callable[[], object] = lambda: None
+) -> Generator[list[int]]:
+    """Let the first signal call `stop`, for a clean end; the second calls `abandon` and ends.
 
     Yields the list of signals received so far.
     """
@@ -45,19 +83,18 @@ def stopping(stop: Callable[[], object]) -> Generator[list[int]]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         if received:
-            os._exit(128 + number)
+            abandon()
+            os._exit(CODES[number])
         received.append(number)
         stop()
 
-    watched = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-    before = {number: signal.signal(number, handle) for number in watched}
+    before = _install(dict.fromkeys(CODES, handle))
     try:
         yield received
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        _install(before)
 
 
 def exit_code(received: list[int]) -> int:
-    """The code of a command that saved and ended on a signal: 130 after Ctrl-C, else 143."""
-    return 130 if received[0] == signal.SIGINT else 143
+    """The code of a command that saved and ended on a signal: 130 after Ctrl-C, for example."""
+    return CODES[received[0]]

@@ -246,9 +246,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def refused(capsys: pytest.CaptureFixture[str], here: Path) -> Refused:
     """Run a command that must be refused with one line and leave every file as it is."""
 
-    def run(*words: object) -> str:
+    def run(*words: object, code: int = 2) -> str:
         before = tree(here)
-        assert main([str(word) for word in words]) == 2
+        assert main([str(word) for word in words]) == code
         printed = capsys.readouterr()
         assert printed.out == ""
         assert re.fullmatch(r"pacesetter: [^\n]+\n", printed.err), printed.err
@@ -672,7 +672,7 @@ def test_run_in_use(run: RunDirectory, refused: Refused, whole: RunDirectory) ->
             assert holder.stdout.readline() == "held\n"
             assert run.in_use()
             before = tree(run.path)
-            says(refused("resume", run.path), ["in use", str(holder.pid), platform.node()])
+            says(refused("resume", run.path, code=75), ["in use", str(holder.pid), platform.node()])
             assert tree(run.path) == before
         finally:
             holder.kill()
@@ -688,7 +688,7 @@ def test_new_run_in_use(refused: Refused, here: Path) -> None:
     first = RunDirectory(path)
     first.lock()
     try:
-        says(refused(*TRAIN), ["in use", str(os.getpid()), platform.node()])
+        says(refused(*TRAIN, code=75), ["in use", str(os.getpid()), platform.node()])
     finally:
         first.unlock()
 

@@ -275,6 +275,8 @@ class Here:
     def stop(self, task: Outcome) -> None:
         self.stopped += 1
 
+    kill = stop
+
 
 def run(jobs: list[Job], executor: Any) -> Bench:
     work = Bench(jobs)
@@ -402,24 +404,29 @@ def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
     assert len(work.finished) == 2
 
 
-def test_run_that_another_was_quicker_with(
-    jobs: list[Job], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Exit 2 of a command that met another process's run is no failure."""
+def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:
+    """A command that met another process's run has not failed; its code says so, not its words."""
 
     def overtaken(words: list[str]) -> int:
         stop_at(200)(words)
         return main(words)
 
-    def in_use(words: list[str]) -> Outcome:
+    def in_use(words: list[str]) -> int:
         jobs[0].directory.lock()
-        assert main(words) == 2
+        code = main(words)
         jobs[0].directory.unlock()
-        return Outcome(2, capsys.readouterr().err)
+        return code
 
     work = run(jobs[:1], executor := Here(overtaken, in_use))
     assert executor.calls == ["train", "resume", "resume"]
     assert (work.finished, work.failed) == (jobs[:1], {})
+
+
+def test_words_of_a_command_decide_nothing(jobs: list[Job]) -> None:
+    """A task may say what it likes; bad input stays bad input."""
+    work = run(jobs[:1], executor := Here(lambda words: Outcome(2, "the robot is in use by me")))
+    assert executor.calls == ["train"]
+    assert work.failed == {str(jobs[0]): "exit 2: the robot is in use by me"}
 
 
 def test_run_of_other_settings_is_refused(
@@ -547,7 +554,7 @@ def test_printed_job_array(
         (here / name).write_text(f"#!/bin/bash\n{body}\n")
         (here / name).chmod(0o755)
     environment = {"PATH": f"{here}:/usr/bin:/bin", "SLURM_ARRAY_JOB_ID": "12"}
-    for code in (0, 143, 1):
+    for code in (0, 143, 75):
         task = {"SLURM_ARRAY_TASK_ID": "1", "CODE": str(code)}
         done = subprocess.run(["bash", "array.sh"], env=environment | task)
         assert done.returncode == code
@@ -611,6 +618,43 @@ def test_interrupted_bench_saves_all_and_goes_on(jobs: list[Job]) -> None:
         assert 0 < trainer.progress.step < 1_000_000
         assert trainer.progress.step >= job.directory.rows()[-1]["step"]
         trainer.close()
+
+
+HANGS = """
+import time
+from pathlib import Path
+import gymnasium
+class Hangs(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,))
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    def reset(self, **options):
+        Path("hangs").touch()
+        while True:
+            time.sleep(1)
+gymnasium.register("Hangs-v0", entry_point=Hangs)
+"""
+
+
+def test_second_interrupt_ends_a_hung_run(here: Path) -> None:
+    """The first waits for it to save, which it never does; no process is left behind."""
+    (here / "hangs.py").write_text(HANGS)
+    process = start("--algos", "td3", "--envs", "hangs:Hangs-v0", "-q")
+    wait_for(Path("hangs").exists, process)
+    (child,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=10)
+    assert process.returncode == 130
+    wait_until(lambda: not Path(f"/proc/{child}").exists())
+
+
+def wait_until(what: Callable[[], object]) -> None:
+    end = time.monotonic() + 10
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
 
 
 def test_bench_of_processes(jobs: list[Job], undisturbed: Path) -> None:

@@ -110,7 +110,10 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
     work = Bench(jobs)
     work.check_envs()
     executor = _executor(own)
-    with stopping(work.stop) as received, display(work, own["quiet"]) as show:
+    with (
+        stopping(work.stop, lambda: work.kill(executor)) as received,
+        display(work, own["quiet"]) as show,
+    ):
         for _ in work.run(executor):
             show(work)
     for name, why in work.failed.items():

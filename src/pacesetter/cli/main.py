@@ -1,8 +1,8 @@
 """The command line: find the verb, call it, and turn what goes wrong into one line and a code."""
 
-import os
 import sys
 from collections.abc import Callable
+from signal import SIGINT
 
 from pacesetter.cli.bench import bench
 from pacesetter.cli.compare import compare
@@ -14,6 +14,7 @@ from pacesetter.cli.show import show
 from pacesetter.cli.train import resume, train
 from pacesetter.cli.tune import tune
 from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.process import Interrupted, exit_code
 
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
@@ -36,24 +37,23 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
 def main(arguments: list[str] | None = None) -> int:
     """Run one command. Returns its exit code.
 
-    0: done. 1: a run failed. 2: bad input. 130 or 143: saved after a signal.
+    0: done. 1: a run failed. 2: bad input. 75: the run is in use. 129, 130 or 143: a signal.
     """
     try:
         return _run(sys.argv[1:] if arguments is None else arguments)
     except UsageError as error:
         print(f"pacesetter: {error}", file=sys.stderr)
-        return 2
+        return error.code
     except TrainingError as error:
         print(f"pacesetter: stopped: {error}", file=sys.stderr)
-        return 1
+        return error.code
     except MemoryError as error:
         print(f"pacesetter: stopped: out of memory: {error}; ask for less", file=sys.stderr)
         return 1
+    except Interrupted as signal:
+        return exit_code([*signal.args])
     except KeyboardInterrupt:
-        return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return exit_code([SIGINT])
     except OSError as error:
         print(f"pacesetter: stopped: {error}", file=sys.stderr)
         return 1
@@ -87,7 +87,3 @@ def _overview() -> str:
             "`pacesetter VERB --help` tells more about a verb.",
         ]
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from pacesetter.runs.directory import (
     FREE_PER_SEED,
-    IN_USE,
     SCHEMA,
     Row,
     RunDirectory,
@@ -11,7 +10,6 @@ from pacesetter.runs.finding import find, find_all, find_group, find_matching
 
 __all__ = [
     "FREE_PER_SEED",
-    "IN_USE",
     "SCHEMA",
     "Row",
     "RunDirectory",

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config, resolve
-from pacesetter.errors import UsageError
+from pacesetter.errors import InUseError, UsageError
 from pacesetter.runs.provenance import provenance
 from pacesetter.settings.validation import difference
 from pacesetter.storage import TEMPORARY, write_atomically
 
 SCHEMA = 1
-IN_USE = "is in use by"
 # Settings in which the seeds of one name may differ.
 FREE_PER_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
 Row = dict[str, Any]
@@ -197,7 +196,7 @@ class RunDirectory:
             file.seek(0)
             holder = file.read(200).strip() or "another process"
             file.close()
-            raise UsageError(f"run: {self.path} {IN_USE} {holder}") from None
+            raise InUseError(f"run: {self.path} is in use by {holder}") from None
         file.truncate(0)
         file.write(f"process {os.getpid()} on {platform.node()}\n")
         file.flush()

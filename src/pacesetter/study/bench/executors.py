@@ -8,13 +8,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
-from pacesetter.process import cores
+from pacesetter.process import CODES, cores
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
 
@@ -40,6 +40,10 @@ class Local:
 
     def stop(self, task: Any) -> None:
         task[0].terminate()
+
+    def kill(self, task: Any) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(task[0].pid, signal.SIGKILL)
 
 
 class Ray:
@@ -71,12 +75,15 @@ class Ray:
         try:
             return Outcome(*self._ray.get(task))
         except self._ray.exceptions.TaskCancelledError:
-            return Outcome(143, "")
+            return Outcome(CODES[signal.SIGTERM], "")
         except self._ray.exceptions.RayError as error:  # its worker or its node is lost
             return Outcome(1, str(error))
 
     def stop(self, task: Any) -> None:
         self._ray.cancel(task)
+
+    def kill(self, task: Any) -> None:
+        self._ray.cancel(task, force=True)
 
 
 def run_command(words: list[str], folder: str) -> tuple[int, str]:
@@ -151,7 +158,7 @@ commands=(
 srun bash -c "${{commands[$SLURM_ARRAY_TASK_ID]}}"
 code=$?
 case $code in
-130 | 143) scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" ;; # saved: go on
+129 | 130 | 143) scontrol requeue "${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID" ;; # saved: go on
 esac
 exit $code
 """

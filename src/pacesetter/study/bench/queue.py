@@ -12,13 +12,14 @@ from typing import Any, NamedTuple, Protocol
 
 from pacesetter import storage
 from pacesetter.ensemble.progress import Progress
-from pacesetter.errors import UsageError
-from pacesetter.runs import IN_USE
+from pacesetter.errors import InUseError, UsageError
+from pacesetter.process import CODES
 from pacesetter.settings.budget import is_spent
 from pacesetter.study.bench.suite import Job
 
 RETRIES = 2
-BAD_INPUT, SAVED = 2, (130, 143)  # exit codes of `train` and `resume`
+# Exit codes of `train` and `resume`.
+BAD_INPUT, IN_USE, SAVED = UsageError.code, InUseError.code, {*CODES.values()}
 POLL = 0.2  # seconds
 ALONE = {"NPROC": "1", "OMP_NUM_THREADS": "1"}  # one thread per run: results never depend on --jobs
 
@@ -45,6 +46,10 @@ class Executor(Protocol):
 
     def stop(self, task: Any) -> None:
         """Ask it to save and end."""
+        ...
+
+    def kill(self, task: Any) -> None:
+        """End it now, with all that it has started."""
         ...
 
 
@@ -91,6 +96,11 @@ class Bench:
     def stop(self) -> None:
         """Ask for the end once the running jobs have saved; may be called from a handler."""
         self._stopping = True
+
+    def kill(self, executor: Executor) -> None:
+        """End the running jobs where they are; may be called from a handler."""
+        for _, task, _ in [*self.running.values()]:
+            executor.kill(task)
 
     def check_envs(self) -> None:
         """Refuse a task that cannot be made, before anything starts."""
@@ -154,7 +164,7 @@ class Bench:
             self.news.append(f"{job}: stopped")
         elif outcome.code in SAVED:
             self._waiting.append(job)
-        elif outcome.code == BAD_INPUT and (IN_USE in outcome.output or overtaken):
+        elif outcome.code == IN_USE or (outcome.code == BAD_INPUT and overtaken):
             self._set_aside(job)
         elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
             self._fail(job, words, outcome)
