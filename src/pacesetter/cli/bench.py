@@ -12,14 +12,17 @@ from pacesetter.process import cores, exit_code, stopping
 from pacesetter.settings import Settings
 from pacesetter.study.bench import suite as suites
 from pacesetter.study.bench.suite import Suite
+from pacesetter.tracking import chosen
 
-OWN = ("algos", "jobs", "executor", "address", "print", "runs", "quiet", "env.KEY")
+OWN = ("algos", "jobs", "executor", "address", "print", "runs", "log", "quiet", "env.KEY")
 
 
 def bench(words: list[str]) -> int:
     """Train every algorithm on every env with every seed; skip what is done."""
     suite, flags, own = _parse(words)
-    jobs = suites.expand(suite, flags, own["runs"])
+    chosen(own["log"])
+    always = () if own["log"] is None else (f"--log={own['log']}",)
+    jobs = suites.expand(suite, flags, own["runs"], always)
     if own["print"]:
         return _print(suite, jobs, own["print"])
     return _work(jobs, own, words)
@@ -67,6 +70,7 @@ def _parser(name: str | None) -> Parser:
     add("--address", metavar="A", help=address)
     add("--print", choices=("commands", "slurm"), help="print the remaining runs, start none")
     command.add_runs()
+    command.add_log()
     command.add_quiet()
     return command
 

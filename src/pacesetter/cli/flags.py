@@ -8,6 +8,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
+from pacesetter.tracking import NONE, SINKS
 
 RUNS = "runs"
 _POSITIONAL = {"algorithm", "env", "env_kwargs"}
@@ -43,6 +44,12 @@ class Parser(argparse.ArgumentParser):
     def add_quiet(self) -> None:
         """`--quiet`, for verbs that show progress."""
         self.add_argument("-q", "--quiet", action="store_true", help="show no progress")
+
+    def add_log(self) -> None:
+        """`--log`, for verbs that train."""
+        tools = f"{', '.join(SINKS)} or {NONE}; several with commas"
+        about = f"send the log to these trackers too ({tools}; default those of the run, if any)"
+        self.add_argument("--log", metavar="TOOLS", help=about)
 
     def add_env_keywords(self) -> None:
         """`--env.KEY` in the help; `split_env_kwargs` takes it out of the words before parsing."""

@@ -2,16 +2,26 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
+from pacesetter.tracking import chosen, tracked
 
 if TYPE_CHECKING:
     from pacesetter.training.trainer import Trainer
+
+
+class Command(NamedTuple):
+    """A run to train, and the command's own flags: no progress, and trackers of the log."""
+
+    trainer: "Trainer"
+    quiet: bool
+    log: list[str] | None
 
 
 def train(words: list[str]) -> int:
@@ -24,8 +34,8 @@ def resume(words: list[str]) -> int:
     return _run(_resumed_trainer, words)
 
 
-def _new_trainer(words: list[str]) -> tuple["Trainer", bool]:
-    """The new run of `train WORDS`, and whether it is quiet."""
+def _new_trainer(words: list[str]) -> Command:
+    """The new run of `train WORDS`."""
     command = parser("train", "Train an algorithm on a task.")
     algorithm, env, rest = algorithm_and_env(command, words)
     fix_threads()
@@ -34,11 +44,12 @@ def _new_trainer(words: list[str]) -> tuple["Trainer", bool]:
     settings = vars(command.parse(rest))
     settings.pop("env.KEY")
     runs, quiet, config = (settings.pop(key) for key in ("runs", "quiet", "config"))
+    log = chosen(settings.pop("log"))
     if env_kwargs:
         settings["env_kwargs"] = env_kwargs
     from pacesetter.training.trainer import Trainer
 
-    return Trainer(algorithm, env, runs=runs, config=config, **settings), quiet
+    return Command(Trainer(algorithm, env, runs=runs, config=config, **settings), quiet, log)
 
 
 def _add_settings(command: Any, algorithm: str, env: str) -> None:
@@ -56,14 +67,15 @@ def _add_settings(command: Any, algorithm: str, env: str) -> None:
     command.add_env_keywords()
     command.add_argument("--config", metavar="FILE", help="read settings from a .toml or .json")
     command.add_runs()
+    command.add_log()
     command.add_quiet()
     hidden = fields_of(Ensemble) if issubclass(hyper, OnPolicy) else ()
     add_settings(command, "settings of the run", Run, defaults, hidden)
     add_settings(command, f"settings of {base}", hyper, defaults)
 
 
-def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
-    """The old run of `resume WORDS`, and whether it is quiet."""
+def _resumed_trainer(words: list[str]) -> Command:
+    """The old run of `resume WORDS`."""
     from pacesetter.runs import find
 
     command = parser("resume", "Continue a run from its last checkpoint, exactly as it would have.")
@@ -71,13 +83,16 @@ def _resumed_trainer(words: list[str]) -> tuple["Trainer", bool]:
     command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
     command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
     command.add_runs()
+    command.add_log()
     command.add_quiet()
     found = command.parse(words)
+    log = chosen(found.log)
     directory = find(found.run, found.runs)
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    return Trainer.resume(directory.path, steps=found.steps, time=found.time), found.quiet
+    trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
+    return Command(trainer, found.quiet, log)
 
 
 def name_of(path: Path) -> str:
@@ -85,7 +100,7 @@ def name_of(path: Path) -> str:
     return str(path.relative_to(RUNS)) if path.is_relative_to(RUNS) else str(path)
 
 
-def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str]) -> int:
+def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     """Train to the end or to a signal, and say where the result is."""
     from pacesetter.cli.advice import within_warmup
     from pacesetter.cli.progress import console
@@ -94,7 +109,7 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
     trainers: list[Trainer] = []
     # From before JAX is imported, which dies of an exception of ours or swallows it.
     with stopping(lambda: [each.stop() for each in trainers]) as received:
-        trainer, quiet = begin(words)
+        trainer, quiet, log = begin(words)
         trainers.append(trainer)
         for note in trainer.notes:
             print(f"pacesetter: {note}", file=sys.stderr)
@@ -102,9 +117,14 @@ def _run(begin: Callable[[list[str]], tuple["Trainer", bool]], words: list[str])
             trainer.stop()
         if not quiet and (line := within_warmup(trainer.config)):
             print(f"pacesetter: {line}", file=sys.stderr)
-        with console(trainer, quiet) as sink:
+        with (
+            closing(trainer),
+            tracked(trainer.directory, log) as write,
+            console(trainer, quiet) as show,
+        ):
             for report in trainer:
-                sink(report)
+                write(report.row())
+                show(report)
                 final = report if report.kind == "eval" else final
     run, step = trainer.config.run, trainer.progress.step
     result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""

@@ -1,6 +1,7 @@
 """Optional packages, imported when they are needed."""
 
 import importlib
+from importlib.util import find_spec
 from typing import Any
 
 from pacesetter.errors import UsageError
@@ -11,5 +12,15 @@ def need(what: str, module: str, install: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        name = module.split(".")[0]
-        raise UsageError(f"{what}: {name} is not installed; pip install '{install}'") from None
+        raise _missing(what, module, install) from None
+
+
+def look_for(what: str, module: str, install: str) -> None:
+    """Refuse as `need` does, without the seconds that importing takes."""
+    if find_spec(module) is None:
+        raise _missing(what, module, install)
+
+
+def _missing(what: str, module: str, install: str) -> UsageError:
+    name = module.split(".")[0]
+    return UsageError(f"{what}: {name} is not installed; pip install '{install}'")

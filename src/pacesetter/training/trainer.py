@@ -166,6 +166,8 @@ class Trainer:
 
     def close(self) -> None:
         """Let go of envs, files and the folder."""
+        if self._closed:
+            return
         self._closed = True
         try:
             self.loop.close()

@@ -136,9 +136,10 @@ def commands(jobs: Iterable[Job]) -> list[str]:
     for job in jobs:
         path = shlex.quote(str(job.directory.path))
         config = shlex.quote(str(job.directory.config_file))
-        train = shlex.join(job.words)
+        train, always = shlex.join(job.words), shlex.join([*job.always, "-q"])
         lines.append(
-            f"if [ -e {config} ]; then {program} resume {path} -q; else {program} {train} -q; fi"
+            f"if [ -e {config} ]; then {program} resume {path} {always}; "
+            f"else {program} {train} {always}; fi"
         )
     return lines
 

@@ -67,8 +67,8 @@ def is_finished(job: Job) -> bool:
 def words_of(job: Job) -> list[str]:
     """The command that continues a run: `resume` if its folder holds one, else `train`."""
     if job.directory.config_file.exists():
-        return ["resume", str(job.directory.path), "-q"]
-    return [*job.words, "-q"]
+        return ["resume", str(job.directory.path), *job.always, "-q"]
+    return [*job.words, *job.always, "-q"]
 
 
 class Bench:

@@ -29,11 +29,15 @@ class Suite(NamedTuple):
 
 
 class Job(NamedTuple):
-    """One run: its checked settings, its folder, and the words of the command that starts it."""
+    """One run: its checked settings, its folder, and the words of the command that starts it.
+
+    `always` are flags that a command which resumes it takes as well.
+    """
 
     config: Config
     directory: RunDirectory
     words: list[str]
+    always: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         run = self.config.run
@@ -85,7 +89,9 @@ def count(suite: Suite) -> int:
     return sum(len(_envs(t.get("envs"))) * len(_seeds(t.get("seeds", 1))) for t in tables)
 
 
-def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
+def expand(
+    suite: Suite, flags: Settings, runs: str | Path, always: tuple[str, ...] = ()
+) -> list[Job]:
     """Every run, the first seed of all entries first; flags win over what the suite says."""
     jobs: list[Job] = []
     for name, entry in suite.entries.items():
@@ -97,6 +103,7 @@ def expand(suite: Suite, flags: Settings, runs: str | Path) -> list[Job]:
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
+    jobs = [job._replace(always=always) for job in jobs]
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
