@@ -171,10 +171,15 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
 
 
 def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
-    if hyper.n_step * run.members > ROWS_A_TICK:
+    if hyper.n_step * run.members * hyper.num_envs > ROWS_A_TICK:
         raise UsageError(
-            f"n_step: {hyper.n_step} with {run.members} members; "
+            f"n_step: {hyper.n_step} with {run.members} members of {hyper.num_envs} envs; "
             f"their product must be at most {ROWS_A_TICK}"
+        )
+    if hyper.assess and hyper.num_envs > 1:
+        raise UsageError(
+            f"num_envs: --assess judges a policy by whole episodes in one env, got "
+            f"{hyper.num_envs} envs; use --num-envs 1 or --assess 0"
         )
     if hyper.block > 1 and (hyper.update_at == "episode" or hyper.assess):
         raise UsageError(

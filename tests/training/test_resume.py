@@ -29,6 +29,14 @@ CASES = {
     "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
     "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
     "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
+    "envs": {"env": "Hopper-v5", "algorithm": "sac", "num_envs": 3, "n_step": 3},
+    "envs-of-members": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "num_envs": 2,
+        "replay": "return",
+        "update_every": 5,
+    },
     "parameter": {
         "env": "Hopper-v5",
         "algorithm": "multi-td3",

@@ -48,9 +48,10 @@ class Members:
             learner, layout, run.seed, self.normalizer.enabled, hyper.precision
         )
         self.learners = Learners(compiled, run.members, run.seed, run.same_init)
+        # Env n of member k has the number n K + k.
         self.explorers = [
-            Explorer(learner, env, self.learners.policy_params[k], run.seed, k)
-            for k, env in enumerate(envs)
+            Explorer(learner, env, self.learners.policy_params[i % run.members], run.seed, i)
+            for i, env in enumerate(envs)
         ]
         self.queues = [NStepQueue(hyper.n_step) for _ in envs]
         self.replays: list[Replay] = []
@@ -101,29 +102,32 @@ class Members:
         """The replay of a member: the shared one, or its own."""
         return self.replays[k % len(self.replays)]
 
-    # Collect.
+    # Collect: i is the number of an env, k that of its member.
 
     def collect(self) -> None:
-        """Every member that is in an episode and has no updates due acts, up to the budget."""
-        progress = self.progress
-        for k, explorer in enumerate(self.explorers):
+        """Every env acts whose episode runs and whose member has no updates due."""
+        progress, members = self.progress, self.config.run.members
+        for i, explorer in enumerate(self.explorers):
             if explorer.starting:
-                self._start_episode(k)
-        acting = [k for k, e in enumerate(self.explorers) if e.active and not self._updates_due(k)]
-        for k in acting[: self.budget - progress.step]:
-            with blame(k, progress.step):
-                self._step(k)
+                self._start_episode(i)
+        due = [self._updates_due(k) for k in range(members)]
+        acting = [i for i, e in enumerate(self.explorers) if e.active and not due[i % members]]
+        for i in acting[: self.budget - progress.step]:
+            with blame(i % members, progress.step):
+                self._step(i)
 
-    def _start_episode(self, k: int) -> None:
-        for transition in self.queues[k].flush():  # those of an episode that was abandoned
-            self.replay(k).add(transition, k)
-        self.replay(k).sampler.end(k, None)
+    def _start_episode(self, i: int) -> None:
+        k = i % self.config.run.members
+        for transition in self.queues[i].flush():  # those of an episode that was abandoned
+            self.replay(k).add(transition, i)
+        self.replay(k).sampler.end(i, None)
         with blame(k, self.progress.step):
-            self.explorers[k].start(self.learners.policy_params[k], self.progress.step)
+            self.explorers[i].start(self.learners.policy_params[k], self.progress.step)
         self.policy_checkpoints.start_episode(k)
 
-    def _step(self, k: int) -> None:
-        hyper, progress, explorer = self.config.hyper, self.progress, self.explorers[k]
+    def _step(self, i: int) -> None:
+        hyper, progress, explorer = self.config.hyper, self.progress, self.explorers[i]
+        k = i % self.config.run.members
         member = progress.members[k]
         if progress.step < hyper.warmup:
             action = explorer.random_action()
@@ -132,20 +136,20 @@ class Members:
             action = explorer.act(self.learners.policy_params[k], seen)
             member.actions += 1
         transition = explorer.step(action, hyper.gamma, clipped=True)
-        for complete in self.queues[k].push(transition):
-            self.replay(k).add(complete, k)
+        for complete in self.queues[i].push(transition):
+            self.replay(k).add(complete, i)
         self.normalizer.add(transition.observation)
         member.steps += 1
         if progress.step > hyper.warmup or hyper.warmup_updates:
             member.updates_due += hyper.updates_per_step
         if transition.last:
-            self._end_episode(k)
+            self._end_episode(i, k)
 
-    def _end_episode(self, k: int) -> None:
-        progress, member, explorer = self.progress, self.progress.members[k], self.explorers[k]
-        total = explorer.env.earned
+    def _end_episode(self, i: int, k: int) -> None:
+        progress, explorer = self.progress, self.explorers[i]
+        member, total = progress.members[k], explorer.env.earned
         progress.end_episode(k, total, len(explorer.env.actions))
-        self.replay(k).sampler.end(k, total)
+        self.replay(k).sampler.end(i, total)
         self.selector.end_episode(k, total, explorer.started, member.copied)
         if self.config.hyper.assess and explorer.started >= self.config.hyper.warmup:
             updates = member.update_calls * self.updates_per_call
@@ -171,8 +175,10 @@ class Members:
         hyper, member = self.config.hyper, self.progress.members[k]
         if member.updates_due < self.updates_per_call or not len(self.replay(k)):
             return False
-        at_episode_end = hyper.update_at == "episode"
-        if member.steps % hyper.block or (at_episode_end and self.explorers[k].active):
+        if member.steps % hyper.block >= hyper.num_envs:  # no block was filled by the last tick
+            return False
+        own = self.explorers[k :: self.config.run.members]
+        if hyper.update_at == "episode" and all(explorer.active for explorer in own):
             return False
         return self.policy_checkpoints.may_update(k)
 
@@ -205,9 +211,10 @@ class Members:
     def end_round(self) -> Selection | None:
         """Select where a round or an interval is over; send on the members that waited."""
         run, progress = self.config.run, self.progress
-        ended = [k for k, explorer in enumerate(self.explorers) if not explorer.active]
-        over = len(ended) == run.members if run.wait else bool(ended)
-        if over and any(self._updates_due(k) for k in ended):
+        ended = [i for i, explorer in enumerate(self.explorers) if not explorer.active]
+        waits = run.wait and run.members > 1
+        over = len(ended) == len(self.explorers) if waits else bool(ended)
+        if over and any(self._updates_due(i % run.members) for i in ended):
             return None  # so many updates that they take several ticks
         selection = None
         if self.selector.trials_are_due(progress.step):
@@ -218,8 +225,8 @@ class Members:
         if selection is not None:
             self.apply(selection)
         if over:
-            for k in ended:
-                self.explorers[k].starting = True
+            for i in ended:
+                self.explorers[i].starting = True
         return selection
 
     def apply(self, selection: Selection) -> None:

@@ -71,14 +71,14 @@ class Replay:
         """Whether more rows would eat into what the checkpoint before the latest needs."""
         return self.head - self.committed + self.rows_per_tick >= UNCOMMITTED + MAX_ROWS_PER_TICK
 
-    def add(self, transition: Transition, member: int = 0) -> None:
-        """Store one transition of a member."""
-        self.append(self.layout.pack(transition), transition.earned or 0.0, member)
+    def add(self, transition: Transition, env: int = 0) -> None:
+        """Store one transition of env `env`."""
+        self.append(self.layout.pack(transition), transition.earned or 0.0, env)
 
-    def append(self, row: Floats, earned: float = 0.0, member: int = 0) -> None:
+    def append(self, row: Floats, earned: float = 0.0, env: int = 0) -> None:
         """Store one transition that is packed already."""
         self.rows[self.head % self.slots] = row
-        self.sampler.add(self.head, member, earned)
+        self.sampler.add(self.head, env, earned)
         self.head += 1
 
     def padded(self, size: int) -> Floats:

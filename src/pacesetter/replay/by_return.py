@@ -30,13 +30,13 @@ class ByReturn(Sampler):
         self.ranking: Reals = np.zeros(0)  # sorted scores
         self.head = 0
 
-    def add(self, number: int, member: int, earned: float) -> None:
+    def add(self, number: int, env: int, earned: float) -> None:
         self.scores[number % self.size] = np.nan
-        self.running.setdefault(member, []).append((number, earned))
+        self.running.setdefault(env, []).append((number, earned))
         self.head = number + 1
 
-    def end(self, member: int, total: float | None) -> None:
-        rows = [row for row in self.running.pop(member, []) if row[0] >= self.head - self.size]
+    def end(self, env: int, total: float | None) -> None:
+        rows = [row for row in self.running.pop(env, []) if row[0] >= self.head - self.size]
         if total is None or not rows:
             return
         for number, earned in rows:
@@ -75,7 +75,7 @@ class ByReturn(Sampler):
         return ((FLOOR + rank) / (FLOOR + 1)) ** self.exponent
 
     def arrays(self, window: range) -> Arrays:
-        rows = [(member, *row) for member, rows in self.running.items() for row in rows]
+        rows = [(env, *row) for env, rows in self.running.items() for row in rows]
         return {
             "scores": self.scores[: len(window)],
             "ranking": self.ranking,
@@ -90,8 +90,8 @@ class ByReturn(Sampler):
         self.ranking = arrays["ranking"]
         self.ended = deque((float(total), int(last)) for total, last in arrays["ended"])
         self.running = {}
-        for member, number, earned in arrays["running"]:
-            self.running.setdefault(int(member), []).append((int(number), float(earned)))
+        for env, number, earned in arrays["running"]:
+            self.running.setdefault(int(env), []).append((int(number), float(earned)))
         self.head = window.stop
 
     def _sampled(self) -> Reals:

@@ -23,11 +23,11 @@ class Sampler:
     what they need.
     """
 
-    def add(self, number: int, member: int, earned: float) -> None:
-        """A member wrote row `number`; its episode had returned `earned` before that step."""
+    def add(self, number: int, env: int, earned: float) -> None:
+        """Env `env` wrote row `number`; its episode had returned `earned` before that step."""
 
-    def end(self, member: int, total: float | None) -> None:
-        """A member's episode ended with a return; None if it was abandoned unfinished."""
+    def end(self, env: int, total: float | None) -> None:
+        """The episode of env `env` ended with a return; None if it was abandoned unfinished."""
 
     def sample(
         self, rng: np.random.Generator, shape: Shape, window: range, done: float

@@ -168,6 +168,7 @@ class OffPolicy(Hyper):
     updates_per_step: float = Field(
         1.0, gt=0, le=1_000, description="critic updates per env step of the member"
     )
+    num_envs: int = Field(1, ge=1, le=1_000, description="envs per member, stepped in turn")
     update_at: Literal["step", "episode"] = Field(
         "step", description="update after each step, or make all due updates when the episode ends"
     )

@@ -98,7 +98,7 @@ class Trainer:
         on_policy = isinstance(hyper, OnPolicy)
         envs = [
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
-            for index in range(hyper.parallel_envs if on_policy else run.members)
+            for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
         ]
         envs[0].check()
         self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
