@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter.algorithms import sac
 from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
 from pacesetter.batch import Batch
-from pacesetter.settings import STRICT, Count
+from pacesetter.settings import STRICT
+from pacesetter.settings.values import Count
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -13,18 +13,10 @@ from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
 from pacesetter.errors import UsageError, unknown
-from pacesetter.settings import (
-    ROWS_A_TICK,
-    STRICT,
-    Count,
-    Duration,
-    OffPolicy,
-    OnPolicy,
-    Settings,
-    budget,
-)
+from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settings, budget
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import build, fields_of
+from pacesetter.settings.values import Count, Duration
 
 
 def _check_json(value: dict[str, Any]) -> dict[str, Any]:
@@ -88,6 +80,14 @@ class Config(NamedTuple):
         after = self.run.select_after
         return self.hyper.warmup if after is None else after
 
+    @property
+    def lr_updates(self) -> float:
+        """Critic updates of one member until its learning rates have fallen to `--lr-end`."""
+        hyper = self.hyper
+        idle = 0 if hyper.warmup_updates else hyper.warmup
+        learning = max((hyper.lr_horizon or 0) * self.steps_per_count - idle, 1)
+        return learning / self.run.members * hyper.updates_per_step
+
     def settings(self) -> Settings:
         """All settings as one flat table, which `resolve` takes back."""
         return asdict(self.run) | asdict(self.hyper)
@@ -119,30 +119,6 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
     return name, []
 
 
-def read_file(path: Path, name: str | None = None) -> Settings:
-    """Settings from a TOML or JSON file, or from a run's config.json.
-
-    The latter is refused if `name` is neither its algorithm nor its name. Raises UsageError.
-    """
-    try:
-        text = path.read_text()
-        table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"config: cannot read {path}: {error}") from None
-    if not isinstance(table, dict):
-        raise UsageError(f"config: {path} must hold a table of settings")
-    found: Any = table.get("settings", table)
-    if not isinstance(found, dict):
-        raise UsageError(f"config: settings in {path} must be a table")
-    whole = {found.get("algorithm"), found.get("name")} if "settings" in table else {name}
-    if name is not None and name not in whole:
-        raise UsageError(
-            f"config: {path} holds all settings of a run of {found.get('algorithm')}; "
-            f"they cannot be those of {name}"
-        )
-    return {key.replace("-", "_"): value for key, value in found.items()}
-
-
 def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     """Merge defaults, presets and the given layers, of which later ones win; check them once."""
     base, below = preset_layers(name, env)
@@ -162,6 +138,8 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
         _refuse_conflicts(run, hyper)
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
+        if hyper.lr_end != 1 and hyper.lr_horizon is None:
+            hyper = replace(hyper, lr_horizon=run.steps)
     if isinstance(hyper, OnPolicy):
         _refuse_ensemble(run)
         rollout = hyper.parallel_envs * hyper.rollout_length

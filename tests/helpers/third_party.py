@@ -14,7 +14,8 @@ from pacesetter.algorithms.contract import Array, Learner, Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.policy import Actors, forward
-from pacesetter.settings import STRICT, OffPolicy, Width
+from pacesetter.settings import STRICT, OffPolicy
+from pacesetter.settings.values import Width
 from pacesetter.types import Floats
 
 

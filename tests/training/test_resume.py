@@ -29,7 +29,7 @@ CASES = {
     "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
     "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
     "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
-    "envs": {"env": "Hopper-v5", "algorithm": "sac", "num_envs": 3, "n_step": 3},
+    "envs": {"env": "Hopper-v5", "algorithm": "sac", "num_envs": 3, "n_step": 3, "lr_end": 0.1},
     "envs-of-members": {
         "env": "Hopper-v5",
         "algorithm": "multi-td3",

@@ -28,7 +28,8 @@ from pacesetter.algorithms.stochastic import Exploration, StochasticLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
-from pacesetter.settings import STRICT, Count, OffPolicy, Width
+from pacesetter.settings import STRICT, OffPolicy
+from pacesetter.settings.values import Count, Width
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

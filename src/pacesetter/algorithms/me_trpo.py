@@ -26,7 +26,8 @@ from pacesetter.dynamics.fit import fit
 from pacesetter.dynamics.model import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
 from pacesetter.networks.trust_region import Gaussian, distribution_of
 from pacesetter.policy import OBSERVATION_LIMIT, Actors
-from pacesetter.settings import STRICT, Count, ModelDriven, Width, only
+from pacesetter.settings import STRICT, ModelDriven, only
+from pacesetter.settings.values import Count, Width
 from pacesetter.types import Floats
 
 

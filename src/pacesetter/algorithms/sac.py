@@ -24,7 +24,8 @@ from pacesetter.algorithms.stochastic import Exploration, StochasticLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
-from pacesetter.settings import STRICT, ActorCritic, LearningRate, Warmup
+from pacesetter.settings import STRICT, ActorCritic
+from pacesetter.settings.values import LearningRate, Warmup
 
 NEXT_Q = 1  # what is folded into a target's key for `next_q`; the action has the key itself
 

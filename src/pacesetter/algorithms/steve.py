@@ -25,7 +25,8 @@ from pacesetter.dynamics.model import Dynamics, Models
 from pacesetter.networks import mlp
 from pacesetter.networks.critic_heads import min_q
 from pacesetter.networks.exploration import Kind
-from pacesetter.settings import STRICT, Width, only
+from pacesetter.settings import STRICT, only
+from pacesetter.settings.values import Width
 
 SMALLEST_VARIANCE = 1e-8  # as in the reference
 MODELS = 2**16  # what is folded into a key for the models: far from what the base splits off

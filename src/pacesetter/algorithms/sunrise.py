@@ -34,7 +34,8 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.networks.critic_heads import min_q
 from pacesetter.policy import Actors, clip, forward
-from pacesetter.settings import STRICT, Count, only
+from pacesetter.settings import STRICT, only
+from pacesetter.settings.values import Count
 from pacesetter.types import Floats
 
 BINS = 5  # of the backups' weights, which lie in [.5, 1]

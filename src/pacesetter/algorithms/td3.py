@@ -23,7 +23,8 @@ from pacesetter.algorithms.deterministic import DeterministicLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import critic_heads, mlp
 from pacesetter.networks.exploration import Kind, adapt
-from pacesetter.settings import STRICT, ActorCritic, Tune
+from pacesetter.settings import STRICT, ActorCritic
+from pacesetter.settings.values import Tune
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)

@@ -29,7 +29,8 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.errors import UsageError
 from pacesetter.networks import critic_heads, mlp, sale
 from pacesetter.policy import Actors
-from pacesetter.settings import STRICT, LearningRate, OffPolicy, Width
+from pacesetter.settings import STRICT, OffPolicy
+from pacesetter.settings.values import LearningRate, Width
 
 FAR = 1e8  # beyond every target: where the smallest and largest one seen begin
 

@@ -33,7 +33,8 @@ from pacesetter.networks.trust_region import (
     log_probability,
 )
 from pacesetter.policy import Actors, forward
-from pacesetter.settings import STRICT, OnPolicy, Width
+from pacesetter.settings import STRICT, OnPolicy
+from pacesetter.settings.values import Width
 from pacesetter.types import Floats
 
 

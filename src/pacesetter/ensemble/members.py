@@ -24,6 +24,7 @@ from pacesetter.errors import blame
 from pacesetter.learner.compiled import CompiledLearner
 from pacesetter.learner.learners import Learners
 from pacesetter.learner.normalizer import Normalizer
+from pacesetter.learner.schedule import factors
 from pacesetter.policy import Policy
 from pacesetter.replay.buffer import Replay, Sample, make_sampler
 from pacesetter.replay.n_step import NStepQueue
@@ -188,6 +189,8 @@ class Members:
         inputs: list[Any] = []
         for k, sample in zip(members, samples, strict=True):
             call, scales = self.progress.members[k].update_calls, self.progress.members[k].scales
+            made = call * self.updates_per_call
+            scales = factors(self.config.hyper, scales, made, self.config.lr_updates)
             inputs.append((call, sample.rows, sample.weight, statistics, None, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):

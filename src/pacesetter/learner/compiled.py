@@ -8,7 +8,7 @@ waiting member shifts nobody's stream and no state ever holds a key.
 
 import copy
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from pacesetter.errors import UsageError
 from pacesetter.learner import products
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
+from pacesetter.learner.schedule import learning_rates
 from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
 from pacesetter.types import Floats
 
@@ -174,7 +175,7 @@ def _key(key: Array, use: KeyUse, call: Any, member: Any) -> Array:
 
 def _scaled(learner: Any, scales: dict[str, Array]) -> Any:
     """The learner with learning rates multiplied by factors, which may be traced."""
-    rates = [field.name for field in fields(learner.hyper) if field.name.endswith("learning_rate")]
+    rates = learning_rates(learner.hyper)
     hyper = copy.copy(learner.hyper)
     for name, scale in scales.items():
         if name not in rates:

@@ -18,7 +18,15 @@ from pacesetter.storage import TEMPORARY, write_atomically
 
 SCHEMA = 1
 # Settings in which the seeds of one name may differ.
-FREE_PER_SEED = {"seed", "steps", "time", "replay_horizon", "checkpoint_every", "device"}
+FREE_PER_SEED = {
+    "seed",
+    "steps",
+    "time",
+    "replay_horizon",
+    "lr_horizon",
+    "checkpoint_every",
+    "device",
+}
 Row = dict[str, Any]
 
 

@@ -1,34 +1,14 @@
-"""Settings of learners: kinds of values, ranges for `tune`, and what several learners share."""
+"""Settings that several learners share."""
 
-import re
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
+
+from pacesetter.settings.values import Count, LearningRate, Switch, Tau, Tune, Warmup, Width
 
 Settings = dict[str, Any]
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-_MULTIPLES = {"": 1, "k": 1_000, "m": 1_000_000}
-_SECONDS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
-
-
-def _count(value: object) -> object:
-    found = re.fullmatch(r"(\d+(?:\.\d+)?(?:e\d+)?)([km]?)", str(value).strip().lower())
-    if found is None:
-        raise ValueError("is not a count; write 5000, 300k, 1M or 1e6")
-    number = float(found[1]) * _MULTIPLES[found[2]]
-    if number > 1e15:
-        raise ValueError("is too large")
-    if number != int(number):
-        raise ValueError("is not a whole number")
-    return int(number)
-
-
-def _duration(value: object) -> object:
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", str(value).strip().lower())
-    if value is not None and found is None:
-        raise ValueError("is not a length of time; write 90s, 5m or 2h")
-    return value if found is None else float(found[1]) * _SECONDS[found[2]]
 
 
 def only(value: float) -> AfterValidator:
@@ -75,7 +55,15 @@ def _check_assess(value: int | None, info: ValidationInfo) -> int | None:
     return value
 
 
+def _check_horizon(value: int | None, info: ValidationInfo) -> int | None:
+    if value is not None and info.data.get("lr_end") == 1:
+        raise ValueError("needs --lr-end below 1, as rates are constant otherwise")
+    return value
+
+
 ROWS_A_TICK = 1_000  # transitions that a replay takes at a time, of all members together
+NORMALIZE = "normalize observations by running mean and standard deviation, clip at 10"
+REPLAY_SIZE = "transitions kept; the oldest are overwritten first"
 # Default exponents of each kind of replay: of priorities, and of importance weights.
 REPLAYS = {
     "uniform": (0.0, 0.0),
@@ -83,29 +71,6 @@ REPLAYS = {
     "lap": (0.4, 0.0),
     "return": (0.6, 0.0),
 }
-
-
-class Tune(NamedTuple):
-    """The range in which `tune` searches a setting: two numbers, or False and True."""
-
-    low: float
-    high: float
-    log: bool = False
-
-    def has(self, value: Any) -> bool:
-        """Whether a value is in the range."""
-        return self.low <= value <= self.high
-
-
-NORMALIZE = "normalize observations by running mean and standard deviation, clip at 10"
-REPLAY_SIZE = "transitions kept; the oldest are overwritten first"
-Width = Annotated[int, Field(ge=1, le=16_384)]
-Count = Annotated[int, BeforeValidator(_count)]
-Duration = Annotated[float, BeforeValidator(_duration)]
-LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
-Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]
-Warmup = Annotated[Count, Tune(1_000, 25_000, log=True)]
-Switch = Annotated[bool, Tune(False, True)]
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -174,6 +139,15 @@ class OffPolicy(Hyper):
     )
     update_every: Count | None = Field(
         None, ge=1, description="env steps of a member between blocks of updates; default 1"
+    )
+    lr_end: float = Field(
+        1.0,
+        ge=0,
+        le=1,
+        description="share of every learning rate that is left at the end; it falls linearly",
+    )
+    lr_horizon: Annotated[Count | None, AfterValidator(_check_horizon)] = Field(
+        None, ge=1, description="env steps until that share is reached; default --steps"
     )
     precision: Literal["f32", "bf16"] = Field(
         "f32", description="precision of large matrix products; accumulation is always float32"

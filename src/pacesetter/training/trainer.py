@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import jax
 
-from pacesetter.config import read_file, resolve
+from pacesetter.config import resolve
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
@@ -21,6 +21,7 @@ from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import out_of_time
+from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report

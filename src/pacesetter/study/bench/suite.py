@@ -7,10 +7,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, read_file, resolve
+from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
+from pacesetter.settings.files import read_file
 
 FOLDER = Path(__file__).with_name("suites")
 MOST_SEEDS = 10_000

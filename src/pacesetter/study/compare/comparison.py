@@ -15,8 +15,9 @@ from pydantic.dataclasses import dataclass as checked
 
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import FREE_PER_SEED
-from pacesetter.settings import STRICT, Count, Duration
+from pacesetter.settings import STRICT
 from pacesetter.settings.validation import build
+from pacesetter.settings.values import Count, Duration
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.results import Run, gather
 from pacesetter.study.compare.stats import Array
@@ -29,7 +30,7 @@ METRICS = {
 CONTROL = "td3"
 ANT = "pacesetter/Ant111"
 # `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
-_FREE = FREE_PER_SEED - {"replay_horizon"}
+_FREE = FREE_PER_SEED - {"replay_horizon", "lr_horizon"}
 _SPENT = ("steps", "updates", "transitions", "cpu", "wall")
 
 

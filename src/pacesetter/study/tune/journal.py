@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
-from pacesetter.settings import Settings, Tune
+from pacesetter.settings import Settings
 from pacesetter.settings.validation import difference, fields_of
+from pacesetter.settings.values import Tune
 
 try:
     import optuna

@@ -1,0 +1,49 @@
+"""Kinds of values that settings have: counts, lengths of time, and the ranges that `tune` takes."""
+
+import re
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BeforeValidator, Field
+
+_MULTIPLES = {"": 1, "k": 1_000, "m": 1_000_000}
+_SECONDS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
+
+
+def _count(value: object) -> object:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?(?:e\d+)?)([km]?)", str(value).strip().lower())
+    if found is None:
+        raise ValueError("is not a count; write 5000, 300k, 1M or 1e6")
+    number = float(found[1]) * _MULTIPLES[found[2]]
+    if number > 1e15:
+        raise ValueError("is too large")
+    if number != int(number):
+        raise ValueError("is not a whole number")
+    return int(number)
+
+
+def _duration(value: object) -> object:
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", str(value).strip().lower())
+    if value is not None and found is None:
+        raise ValueError("is not a length of time; write 90s, 5m or 2h")
+    return value if found is None else float(found[1]) * _SECONDS[found[2]]
+
+
+class Tune(NamedTuple):
+    """The range in which `tune` searches a setting: two numbers, or False and True."""
+
+    low: float
+    high: float
+    log: bool = False
+
+    def has(self, value: Any) -> bool:
+        """Whether a value is in the range."""
+        return self.low <= value <= self.high
+
+
+Width = Annotated[int, Field(ge=1, le=16_384)]
+Count = Annotated[int, BeforeValidator(_count)]
+Duration = Annotated[float, BeforeValidator(_duration)]
+LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
+Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]
+Warmup = Annotated[Count, Tune(1_000, 25_000, log=True)]
+Switch = Annotated[bool, Tune(False, True)]
