@@ -7,7 +7,8 @@ from pydantic.dataclasses import dataclass
 
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import unknown
-from pacesetter.settings import STRICT, Count
+from pacesetter.settings import STRICT
+from pacesetter.settings.values import Count
 
 SELECT_EVERY = 5_000  # env steps
 WINDOWS = {"rescue": 5}  # episodes behind a selection, where the default is not one
