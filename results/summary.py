@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.runs import find_all
+from pacesetter.storage import as_json
 from pacesetter.study.compare.comparison import Comparison, compare
 from pacesetter.study.compare.results import compact
 from pacesetter.study.report import contents, contrasts, paper, tables
@@ -45,7 +46,7 @@ def collect(study: str, folders: list[str]) -> None:
     old = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
     new = [compact(run) for folder in folders for run in find_all(folder)]
     table = {_key(line): line for line in (*old, *new)}
-    lines = [json.dumps(table[key], separators=(",", ":")) for key in sorted(table)]
+    lines = [as_json(table[key], separators=(",", ":")) for key in sorted(table)]
     file.write_text("".join(line + "\n" for line in lines))
 
 

@@ -3,12 +3,14 @@
 import os
 import sys
 
+from pacesetter.cli.streams import UNREAD, guard
 from pacesetter.process import interrupt, leave, on_signals
 
 
 def main() -> int:
     """Run the command that the process was started with. Returns its exit code."""
     on_signals(leave)
+    answer = guard()
     from pacesetter.cli.main import main as command
 
     on_signals(interrupt)
@@ -16,6 +18,9 @@ def main() -> int:
         code = command()
     except SystemExit as end:  # argparse after --help
         code = int(end.code or 0)
+    sys.stdout.flush()
+    if code == 0 and answer.lost:
+        code = UNREAD
     on_signals(lambda number, frame: os._exit(code))  # the work is done and its end is said
     return code
 

@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
+from pacesetter.cli.streams import aside
 from pacesetter.config import Run, preset_layers
 from pacesetter.errors import UsageError
 from pacesetter.process import cores, exit_code, stopping
@@ -112,7 +113,8 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
     if own["jobs"] is not None and own["jobs"] < 1:
         raise UsageError(f"jobs: must be at least 1, got {own['jobs']}")
     work = Bench(jobs)
-    work.check_envs()
+    with aside():
+        work.check_envs()
     executor = _executor(own)
     with (
         stopping(work.stop, lambda: work.kill(executor)) as received,

@@ -1,10 +1,11 @@
 """The verb `eval`."""
 
-import json
 from typing import TYPE_CHECKING, Any
 
 from pacesetter.cli.flags import Parser, parser
 from pacesetter.cli.policies import add_run, add_seed, parse
+from pacesetter.cli.streams import aside
+from pacesetter.storage import as_json
 
 if TYPE_CHECKING:
     from pacesetter.evaluation import Evaluation
@@ -17,11 +18,12 @@ def evaluate(words: list[str]) -> int:
     given, (policy, path, env, env_kwargs) = parse(_parser(), words)
     task = env or policy.about.get("env")
     how: dict[str, Any] = {"noise": given.noise, "env_kwargs": env_kwargs, "random": given.random}
-    result = evaluation.evaluate(policy, env, given.episodes, given.seed, **how)
+    with aside():
+        result = evaluation.evaluate(policy, env, given.episodes, given.seed, **how)
     if given.json:
         about = {"env": task, "env_kwargs": env_kwargs, "seed": given.seed, "noise": given.noise}
         source = None if given.random else str(path)
-        print(json.dumps({**result.table(), **about, "policy": source}))
+        print(as_json({**result.table(), **about, "policy": source}))
     else:
         step = policy.about.get("step", 0)
         who = "uniform actions" if given.random else f"policy of step {step:,}"

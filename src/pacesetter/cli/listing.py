@@ -1,7 +1,6 @@
 """The verb `list`: what there is, as lines or as JSON."""
 
 import inspect
-import json
 from collections.abc import Callable
 from textwrap import fill
 from typing import Any
@@ -12,6 +11,7 @@ from pacesetter.cli.flags import parser
 from pacesetter.cli.show import evaluations, state
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, find_all
+from pacesetter.storage import as_json
 
 WIDTH = 88  # columns of a paragraph
 
@@ -31,7 +31,7 @@ def list_(words: list[str]) -> int:
     if found.json:
         chosen = [found.kind] if found.kind else kinds
         tables = {kind: lists[kind]() for kind in chosen}
-        print(json.dumps(tables[found.kind] if found.kind else tables))
+        print(as_json(tables[found.kind] if found.kind else tables))
     elif found.kind is None:
         print(_everything(lists))
     else:

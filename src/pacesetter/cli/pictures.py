@@ -5,6 +5,7 @@ import re
 
 from pacesetter.cli.flags import Parser, parser
 from pacesetter.cli.policies import add_run, add_seed, parse
+from pacesetter.cli.streams import aside
 
 
 def record(words: list[str]) -> int:
@@ -22,17 +23,18 @@ def record(words: list[str]) -> int:
     given, found = parse(command, words)
     from pacesetter.media.record import record
 
-    film = record(
-        found.policy,
-        given.o,
-        episodes=given.episodes,
-        frames=given.frames,
-        camera=given.camera,
-        size=given.size,
-        seed=given.seed,
-        text=not given.no_text,
-        **found.task,
-    )
+    with aside():
+        film = record(
+            found.policy,
+            given.o,
+            episodes=given.episodes,
+            frames=given.frames,
+            camera=given.camera,
+            size=given.size,
+            seed=given.seed,
+            text=not given.no_text,
+            **found.task,
+        )
     seconds = film.frames / film.rate
     returns = ", ".join(f"{value:,.1f}" for value in film.returns)
     ended = f"; return {returns}" if returns else "; no episode ended"
@@ -53,16 +55,17 @@ def poster(words: list[str]) -> int:
     given, found = parse(command, words)
     from pacesetter.media.poster import poster
 
-    steps = poster(
-        found.policy,
-        given.o,
-        frames=given.frames,
-        size=given.size,
-        cycle=given.cycle,
-        camera=given.camera,
-        seed=given.seed,
-        **found.task,
-    )
+    with aside():
+        steps = poster(
+            found.policy,
+            given.o,
+            frames=given.frames,
+            size=given.size,
+            cycle=given.cycle,
+            camera=given.camera,
+            seed=given.seed,
+            **found.task,
+        )
     print(f"{given.o}: steps {', '.join(f'{step:,}' for step in steps)}")
     return 0
 
@@ -81,14 +84,15 @@ def watch(words: list[str]) -> int:
     given, found = parse(command, words)
     from pacesetter.media.watch import watch
 
-    watch(
-        found.policy,
-        browser=given.browser,
-        episodes=given.episodes,
-        port=given.port,
-        seed=given.seed,
-        **found.task,
-    )
+    with aside():
+        watch(
+            found.policy,
+            browser=given.browser,
+            episodes=given.episodes,
+            port=given.port,
+            seed=given.seed,
+            **found.task,
+        )
     return 0
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pacesetter.cli.flags import parser
 from pacesetter.cli.policies import add_run, add_seed, parse
+from pacesetter.cli.streams import aside
 from pacesetter.errors import UsageError
 
 TARGETS = "onnx (a model for any runtime), minari (a data set), sb3 (a script)"
@@ -24,7 +25,9 @@ def export(words: list[str]) -> int:
     from pacesetter.media.export import export
 
     how = {"episodes": given.episodes, "seed": given.seed}
-    print(export(found.policy, given.to, given.o, **found.task, **how))
+    with aside():
+        made = export(found.policy, given.to, given.o, **found.task, **how)
+    print(made)
     return 0
 
 
@@ -46,7 +49,9 @@ def push(words: list[str]) -> int:
     from pacesetter.media.hub import push
 
     how = {"video": given.video, "private": given.private, "episodes": given.episodes}
-    print(push(found.file, given.repo, **how, seed=given.seed, env=found.env))
+    with aside():
+        page = push(found.file, given.repo, **how, seed=given.seed, env=found.env)
+    print(page)
     return 0
 
 

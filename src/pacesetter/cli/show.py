@@ -1,6 +1,5 @@
 """The verb `show`: where a run stands, what it scored and spent, its settings and versions."""
 
-import json
 from typing import Any
 
 from tabulate import tabulate
@@ -9,6 +8,7 @@ from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
 from pacesetter.settings.budget import budget, is_spent
+from pacesetter.storage import as_json
 
 SHOWN = 5  # evaluations, unless all are asked for
 COUNTS = ("member_steps", "selection_steps", "updates", "transitions", "episodes")
@@ -30,7 +30,7 @@ def show(words: list[str]) -> int:
         told = tell(run)
     except (KeyError, TypeError) as error:
         raise UsageError(f"{run.path}: damaged or foreign: {error}") from None
-    print(json.dumps(told) if found.json else _text(told, None if found.all else SHOWN))
+    print(as_json(told) if found.json else _text(told, None if found.all else SHOWN))
     return 0
 
 

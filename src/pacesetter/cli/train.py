@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
+from pacesetter.cli.streams import aside
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
@@ -108,7 +109,7 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     final: Any = None
     trainers: list[Trainer] = []
     # From before JAX is imported, which dies of an exception of ours or swallows it.
-    with stopping(lambda: [each.stop() for each in trainers]) as received:
+    with aside(), stopping(lambda: [each.stop() for each in trainers]) as received:
         trainer, quiet, log = begin(words)
         trainers.append(trainer)
         for note in trainer.notes:

@@ -4,6 +4,7 @@ import shlex
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, algorithm_and_env, parser, split_env_kwargs
+from pacesetter.cli.streams import aside
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 
@@ -17,7 +18,7 @@ def tune(words: list[str]) -> int:
     from pacesetter.study.tune.search import Tuning
 
     tuning = Tuning(algorithm, env, fixed, own["trials"], own["study"])
-    with stopping(tuning.stop) as received:
+    with aside(), stopping(tuning.stop) as received:
         tuning.run(lambda trainer: console(trainer, own["quiet"]))
     print(tuning.summary())
     if received and not tuning.over:

@@ -14,7 +14,7 @@ from pacesetter.config import Config, resolve
 from pacesetter.errors import InUseError, UsageError
 from pacesetter.runs.provenance import provenance
 from pacesetter.settings.validation import difference
-from pacesetter.storage import TEMPORARY, write_atomically
+from pacesetter.storage import TEMPORARY, as_json, write_atomically
 
 SCHEMA = 1
 # Settings in which the seeds of one name may differ.
@@ -119,7 +119,7 @@ class RunDirectory:
             folder.rmdir()
 
     def _write_config(self, table: Row) -> None:
-        write_atomically(self.config_file, (json.dumps(table, indent=1) + "\n").encode())
+        write_atomically(self.config_file, (as_json(table, indent=1) + "\n").encode())
 
     def record(self) -> Row:
         """The whole config.json."""
@@ -166,7 +166,7 @@ class RunDirectory:
     def append(self, row: Row) -> None:
         """Add one line to the log."""
         with self.metrics_file.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+            file.write(as_json(row) + "\n")
 
     def log_size(self) -> int:
         """Bytes of the log."""

@@ -1,7 +1,6 @@
 """A comparison as one HTML file that needs nothing else: tables, curves, a film, commands."""
 
 import base64
-import json
 import re
 import shlex
 import sys
@@ -16,6 +15,7 @@ from markupsafe import Markup
 
 from pacesetter.errors import UsageError
 from pacesetter.runs.provenance import versions
+from pacesetter.storage import as_json
 from pacesetter.study.compare import lineage
 from pacesetter.study.compare.comparison import Comparison
 from pacesetter.study.compare.results import AXES, Run
@@ -89,7 +89,7 @@ def _small_print(text: str) -> tuple[str, str]:
 
 def _embed(table: Any) -> Markup:
     """JSON inside a script element, which `<` could end."""
-    return Markup(json.dumps(table, separators=(",", ":")).replace("<", "\\u003c"))
+    return Markup(as_json(table, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _charts(comparison: Comparison, window: int | None) -> list[dict[str, Any]]:
