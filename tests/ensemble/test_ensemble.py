@@ -20,13 +20,12 @@ from numeric import all_differ, same
 from scripted_runs import ENV, IDLE, script, start
 from short_runs import assert_same, content, log, run_to_end
 
-from pacesetter import envs
 from pacesetter.algorithms.contract import Learner, Update
 from pacesetter.batch import Layout
 from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.ensemble.rules import RULES, Choice, choose
 from pacesetter.ensemble.selection import POOLED_SELECTIONS, Selection, measure
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, environment
 from pacesetter.errors import UsageError
 from pacesetter.learner.compiled import KEYS, CompiledLearner, KeyUse
 from pacesetter.policy import normalize
@@ -714,7 +713,7 @@ def test_training_selection_and_evaluation_never_share_a_start(
         used.setdefault(stream, []).append(found)
         return found
 
-    monkeypatch.setattr(envs, "episode_seed", recorded)
+    monkeypatch.setattr(environment, "episode_seed", recorded)
     more = {"select_every": 60, "select_window": 2, "eval_every": 60, "eval_episodes": 3}
     trainer = start(runs, select_on="eval", steps=300, **more)
     kinds = [row["kind"] for row in log(run_to_end(trainer))]
