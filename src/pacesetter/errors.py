@@ -2,9 +2,12 @@
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 MAX_LENGTH = 500  # characters
+SHOWN = 80  # characters of a value that is not what it should be
 
 
 class _OneLine(Exception):  # noqa: N818
@@ -29,6 +32,32 @@ class InUseError(UsageError):
 
 class TrainingError(_OneLine):
     """A run that cannot continue, such as one with a NaN; its last good checkpoint is kept."""
+
+
+def reason(error: BaseException) -> str:
+    """Why something failed, by the exception of code that is not ours: its kind and whole text.
+
+    One without a text, such as a bare assert, is told by its place. Some cannot even make theirs.
+    """
+    kind = type(error).__name__
+    try:
+        text = str(error).strip()
+    except Exception:
+        text = ""
+    frames = extract_tb(error.__traceback__)
+    if text or not frames:
+        return f"{kind}: {text}" if text else kind
+    last = frames[-1]
+    return f"{kind} in {Path(last.filename).name}, line {last.lineno}: {last.line}"
+
+
+def show(value: object) -> str:
+    """A value of code that is not ours, short and in one line, even if it cannot be printed."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:
+        return f"a {type(value).__name__} that cannot be printed"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def unknown(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter.envs import Environment
+from pacesetter.envs.border import reward_terms
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy
 from pacesetter.seeding import Stream, generator
@@ -48,9 +49,8 @@ def rollouts(
             observation, ended = step.observation, step.ended
             total += step.reward
             length += 1
-            for name, value in step.info.items():
-                if name.startswith("reward_") and isinstance(value, (int, float, np.number)):
-                    terms[name] = terms.get(name, 0.0) + float(value) / episodes
+            for name, value in reward_terms(step.info):
+                terms[name] = terms.get(name, 0.0) + value / episodes
         returns.append(total)
         lengths.append(length)
     return Evaluation(returns, lengths, float(np.mean(returns)), float(np.std(returns)), terms)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import broken_envs
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -203,19 +204,20 @@ BAD_TASKS = {
     "NanObservation": ["observation", "finite", "number 1", "nan"],
     "NanReset": ["observation", "finite", "nan"],
     "TextObservation": ["observation", "numbers"],
-    "ListObservation": ["observation", "NumPy array", "list"],
-    "WideObservation": ["observation", "float32", "float64"],
-    "OutsideObservation": ["observation", "number 2 is -10.0", "[-9.0, 9.0]"],
     "HugeReward": ["reward", "finite in float32", "1e+39"],
     "InfiniteReward": ["reward", "finite", "inf"],
     "ArrayReward": ["reward", "one number"],
     "NoReward": ["reward", "one number", "None"],
-    "IntTerminated": ["terminated", "bool", "0"],
     "FourValues": ["step", "truncated"],
     "BareReset": ["reset", "(observation, info)"],
     "RaisesInStep": ["the motor is on fire"],
     "RaisesInReset": ["no ground to stand on"],
-    "RaisesWhenMade": ["no licence file"],
+    "RaisesWhenMade": ["OSError: no licence file see the manual"],
+    "MuteWhenMade": ["cannot make", "Mute"],
+    "BareAssert": ["reset", "AssertionError in odd_envs.py, line", 'assert "ground" in words'],
+    "MuteReward": ["reward", "one number", "a Mute that cannot be printed"],
+    "TwoInTerminated": ["terminated", "True or False", "2"],
+    "ListInfo": ["info", "must be a dict", "{} will do"],
     "DictObservation": ["observation space", "Box", "Dict"],
     "DiscreteAction": ["action space", "Box", "Discrete"],
     "DictAction": ["action space", "Box", "Dict"],
@@ -300,7 +302,8 @@ def test_config_that_is_a_folder(refused: Refused, here: Path) -> None:
 
 @pytest.mark.parametrize("name", BAD_TASKS)
 def test_broken_task(name: str, refused: Refused) -> None:
-    says(refused("train", "td3", f"broken_envs:{name}-v0"), [name, *BAD_TASKS[name]])
+    module = "broken_envs" if hasattr(broken_envs, name) else "odd_envs"
+    says(refused("train", "td3", f"{module}:{name}-v0"), [name, *BAD_TASKS[name]])
     assert not Path("runs").exists()
 
 

@@ -56,21 +56,6 @@ class NanReset(Probe):
         return np.full(3, NAN, np.float32), super().reset(**options)[1]
 
 
-class ListObservation(Probe):
-    def step(self, action: Any) -> Any:
-        return [0.0, 0.0, 0.0], *super().step(action)[1:]
-
-
-class WideObservation(Probe):
-    def step(self, action: Any) -> Any:
-        return np.zeros(3), *super().step(action)[1:]
-
-
-class OutsideObservation(Probe):
-    def reset(self, **options: Any) -> Any:
-        return np.float32([0, 0, -10]), super().reset(**options)[1]
-
-
 class Reward(Probe):
     """The reward is whatever `reward` is."""
 
@@ -95,12 +80,6 @@ class ArrayReward(Reward):
 
 class NoReward(Reward):
     reward = None
-
-
-class IntTerminated(Probe):
-    def step(self, action: Any) -> Any:
-        observation, reward, _, truncated, info = super().step(action)
-        return observation, reward, 0, truncated, info
 
 
 class FourValues(Probe):
@@ -263,5 +242,11 @@ def _all(kind: type) -> list[type]:
     return [kind] + [below for child in kind.__subclasses__() for below in _all(child)]
 
 
-for _kind in _all(Probe):
-    gymnasium.register(f"{_kind.__name__}-v0", entry_point=f"{__name__}:{_kind.__name__}")
+def register(module: str) -> None:
+    """Register all tasks of a module by the names of their classes."""
+    for kind in _all(Probe):
+        if kind.__module__ == module:
+            gymnasium.register(f"{kind.__name__}-v0", entry_point=f"{module}:{kind.__name__}")
+
+
+register(__name__)

@@ -1,19 +1,19 @@
 """One env and its running episode: float32, actions in [-1, 1], seeded and resumed exactly."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pacesetter.envs import border
 from pacesetter.envs.spaces import action_bounds
 from pacesetter.envs.tasks import make
-from pacesetter.errors import TrainingError, UsageError
+from pacesetter.errors import TrainingError, UsageError, reason
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.types import Floats
 
 MAX_EPISODE = 100_000  # steps; an episode that never ends would hang every evaluation
-MAX_REWARD = float(np.finfo(np.float32).max)  # the replay keeps rewards in float32
 
 
 class Step(NamedTuple):
@@ -23,7 +23,7 @@ class Step(NamedTuple):
     reward: float
     terminated: bool
     truncated: bool
-    info: dict[str, Any]
+    info: Mapping[Any, Any]
 
     @property
     def ended(self) -> bool:
@@ -61,6 +61,7 @@ class Environment:
         self.actions: list[Floats] = []
         self.earned = 0.0  # rewards of the episode so far
         self.given: Any = None  # the last observation as the env gave it
+        self.paid: list[Any] = []  # the last reward and flags as the env gave them
         self.observation = np.zeros(self.observation_size, np.float32)
 
     def reset(self, episode: int | None = None) -> Floats:
@@ -87,49 +88,30 @@ class Environment:
             raise self._broken(
                 "step", "must return (observation, reward, terminated, truncated, info)"
             )
-        observation, reward, terminated, truncated, info = result
-        if np.ndim(reward) != 0 or not isinstance(reward, (int, float, np.number)):
-            raise self._broken("reward", f"must be one number, got {reward!r}")
-        if not abs(reward) <= MAX_REWARD:
-            raise self._broken("reward", f"must be finite in float32, got {reward}")
-        for what, flag in (("terminated", terminated), ("truncated", truncated)):
-            if not isinstance(flag, (bool, np.bool_)):
-                raise self._broken(what, f"must be a bool, got {flag!r}")
-        if not isinstance(info, dict):
-            raise self._broken("info", f"must be a dict, got {info!r}")
+        observation, *self.paid, info = result
         self.observation = self._observation(observation)
-        self.earned += float(reward)
-        return Step(self.observation, float(reward), bool(terminated), bool(truncated), info)
+        step = Step(
+            self.observation,
+            self._cast("reward", border.reward, result[1]),
+            self._cast("terminated", border.flag, result[2]),
+            self._cast("truncated", border.flag, result[3]),
+            self._cast("info", border.info, info),
+        )
+        self.earned += step.reward
+        return step
 
-    def check(self) -> None:
-        """Refuse an env that breaks the API, before anything is written."""
+    def check(self) -> list[str]:
+        """Refuse an env that breaks the API, before anything is written; what had to be cast."""
+        space = self.env.observation_space
         try:
             self.reset(0)
-            self._check_given()
+            notes = [*border.notes_on_observation(self.given, space)]
             self.step(np.zeros(self.action_size, np.float32))
-            self._check_given()
         except TrainingError as error:
             raise UsageError(f"env: {error}") from None
+        notes += [*border.notes_on_observation(self.given, space), *border.notes_on_step(self.paid)]
         self.episode = -1
-
-    def _check_given(self) -> None:
-        """Refuse an observation outside the env's own observation space."""
-        space: Any = self.env.observation_space
-        given = self.given
-        if not isinstance(given, (np.ndarray, np.generic)):
-            kind = type(given).__name__
-            raise self._broken("observation", f"must be a NumPy array, it is a {kind}")
-        if not np.can_cast(given.dtype, space.dtype):
-            raise self._broken(
-                "observation", f"must be {space.dtype} as its space is, got {given.dtype}"
-            )
-        outside = np.flatnonzero((given < space.low) | (given > space.high))
-        if outside.size:
-            where = int(outside[0])
-            low, value, high = (np.ravel(x)[where] for x in (space.low, given, space.high))
-            raise self._broken(
-                "observation", f"number {where} is {value}, outside its space [{low}, {high}]"
-            )
+        return [f"env: {self.name}: {'; '.join(dict.fromkeys(notes))}"] if notes else []
 
     def snapshot(self) -> Snapshot:
         """Where the running episode is."""
@@ -154,23 +136,17 @@ class Environment:
         try:
             return function()
         except Exception as error:
-            raise self._broken(what, f"failed: {type(error).__name__}: {error}") from error
+            raise self._broken(what, f"failed: {reason(error)}") from error
 
-    def _observation(self, observation: Any) -> Floats:
+    def _cast(self, what: str, function: Callable[..., Any], *given: Any) -> Any:
         try:
-            flat = np.array(observation, np.float32).ravel()
-        except (TypeError, ValueError):
-            raise self._broken("observation", f"must be numbers, got {observation!r}") from None
-        if np.shape(observation) != self.observation_shape:
-            shape = np.shape(observation)
-            raise self._broken(
-                "observation", f"must have shape {self.observation_shape}, has {shape}"
-            )
-        self.given = observation
-        if not np.isfinite(flat).all():
-            where = int(np.flatnonzero(~np.isfinite(flat))[0])
-            raise self._broken("observation", f"must be finite, number {where} is {flat[where]}")
-        return flat
+            return function(*given)
+        except ValueError as error:
+            raise self._broken(what, str(error)) from None
+
+    def _observation(self, given: Any) -> Floats:
+        self.given = given
+        return self._cast("observation", border.observation, given, self.observation_shape)
 
     def _broken(self, what: str, why: str) -> TrainingError:
         return TrainingError(f"{self.name}: {what}: {why}")

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 
 from pacesetter.envs.spaces import check_spaces
-from pacesetter.errors import UsageError, unknown
+from pacesetter.errors import UsageError, reason, unknown
 
 
 def known() -> list[str]:
@@ -48,7 +48,6 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
     try:
         env = make_quietly(name, kwargs or {})
     except Exception as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise UsageError(f"env: cannot make '{name}': {reason}") from None
+        raise UsageError(f"env: cannot make '{name}': {reason(error)}") from None
     check_spaces(name, env)
     return env

@@ -57,7 +57,7 @@ class Trainer:
         except BaseException:
             self.directory.remove()
             raise
-        self.notes = products.notes(self.config.hyper)
+        self.notes += products.notes(self.config.hyper)
 
     @classmethod
     def resume(
@@ -101,7 +101,7 @@ class Trainer:
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
             for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
         ]
-        envs[0].check()
+        self.notes = envs[0].check()
         self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
         self._evaluation_env: Environment | None = None
         self._reports: list[Report] = []

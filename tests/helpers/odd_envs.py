@@ -1,0 +1,113 @@
+"""Tasks that keep to the sense of Gymnasium's rules, not to the letter; and some that do neither.
+
+They are named `odd_envs:NAME-v0`. What can be cast is cast; the rest is refused in one line.
+"""
+
+from typing import Any, NoReturn
+
+import numpy as np
+from broken_envs import Probe, Reward, register
+
+
+class Mute(Exception):  # noqa: N818
+    """An exception, and a value, whose text cannot be made."""
+
+    def __str__(self) -> NoReturn:
+        raise RuntimeError("no words")
+
+    __repr__ = __str__
+
+
+class ListObservation(Probe):
+    def step(self, action: Any) -> Any:
+        return [0.0, 0.0, 0.0], *super().step(action)[1:]
+
+
+class WideObservation(Probe):
+    """float64 in a space of float32, as half of people's own tasks have it."""
+
+    def reset(self, **options: Any) -> Any:
+        return super().reset(**options)[0].astype(np.float64), {}
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        return observation.astype(np.float64), *rest
+
+
+class OutsideObservation(Probe):
+    def reset(self, **options: Any) -> Any:
+        return np.float32([0, 0, -10]), super().reset(**options)[1]
+
+
+class RoundedObservation(Probe):
+    """Outside by a rounding, which is worth no word."""
+
+    def reset(self, **options: Any) -> Any:
+        return np.float32([0, 0, 9.000001]), super().reset(**options)[1]
+
+
+class Converted(Probe):
+    """Its reward and flags go through `pay` and `flag`."""
+
+    pay: Any = staticmethod(float)
+    flag: Any = staticmethod(bool)
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, self.pay(reward), self.flag(terminated), self.flag(truncated), info
+
+
+class LineReward(Converted):
+    pay = staticmethod(lambda reward: np.array([reward]))
+
+
+class PointReward(Converted):
+    pay = staticmethod(np.array)
+
+
+class BoolReward(Converted):
+    pay = staticmethod(lambda reward: np.bool_(reward > 0.5))
+
+
+class IntFlags(Converted):
+    flag = staticmethod(int)
+
+
+class LineFlags(Converted):
+    flag = staticmethod(lambda flag: np.array([flag]))
+
+
+class TwoInTerminated(Converted):
+    flag = staticmethod(lambda flag: 2)
+
+
+class MuteReward(Reward):
+    reward = Mute()
+
+
+class OddInfo(Probe):
+    """Keys that are no strings, beside a reward term."""
+
+    def step(self, action: Any) -> Any:
+        *rest, _ = super().step(action)
+        return *rest, {0: 1, None: 2, ("reward_", 1): 3, "reward_lean": 0.5, "reward_text": "x"}
+
+
+class ListInfo(Probe):
+    def step(self, action: Any) -> Any:
+        *rest, _ = super().step(action)
+        return *rest, []
+
+
+class MuteWhenMade(Probe):
+    def __init__(self) -> None:
+        raise Mute
+
+
+class BareAssert(Probe):
+    def reset(self, **options: Any) -> Any:
+        words = ["sky"]
+        assert "ground" in words
+
+
+register(__name__)
