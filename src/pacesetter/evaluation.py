@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pacesetter.consent import require
 from pacesetter.envs import Environment
 from pacesetter.envs.border import reward_terms
 from pacesetter.errors import UsageError
@@ -99,10 +100,7 @@ def enter(
         raise UsageError(f"env: must be an id such as HalfCheetah-v5, got a {type(name).__name__}")
     if name is None:
         raise UsageError("env: the policy names no env; give one with --env")
-    if env is None and ":" in name:
-        raise UsageError(
-            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
-        )
+    require("env", name, [env])
     own = env_kwargs
     if own is None:
         own = about.get("env_kwargs", {}) if name == about.get("env") else {}

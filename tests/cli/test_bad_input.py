@@ -870,7 +870,7 @@ def test_policy_file_imports_no_module(
     (here / "intruder.py").write_text(INTRUDER)
     monkeypatch.syspath_prepend(here)
     make_policy("intruder:Intruder-v0").save(file)
-    says(refused("eval", file), ["intruder:Intruder-v0", "--env intruder:Intruder-v0"])
+    says(refused("eval", file), ["intruder:Intruder-v0", "--allow intruder:Intruder-v0"])
     assert not (here / "intruded").exists()
     assert "intruder" not in sys.modules
     assert main(["eval", str(file), "--env", "intruder:Intruder-v0", "--episodes", "1"]) == 0

@@ -3,6 +3,7 @@
 import json
 import runpy
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -95,12 +96,14 @@ def test_the_wheel_holds_the_champions(tmp_path: Path) -> None:
 
 
 def test_a_file_imports_a_module_only_where_it_is_named(
-    here: Path, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     untrained(PROBE).save(here / "probe.safetensors")
-    for verb in (["eval"], ["record"], ["poster"], ["export", "--to", "minari", "-o", "a-v0"]):
-        line = refused(capsys, *verb, "probe.safetensors")
-        assert f"allow it with --env {PROBE}" in line, verb
+    with monkeypatch.context() as patch:
+        patch.delitem(sys.modules, "broken_envs")  # as in a new process
+        for verb in (["eval"], ["record"], ["poster"], ["export", "--to", "minari", "-o", "a-v0"]):
+            line = refused(capsys, *verb, "probe.safetensors")
+            assert f"allow it with --allow {PROBE}" in line, verb
     assert main(["eval", "probe.safetensors", "--episodes", "1", "--env", PROBE]) == 0
 
 

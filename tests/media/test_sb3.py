@@ -116,5 +116,5 @@ def test_a_policy_file_cannot_put_code_into_the_script(tmp_path: Path) -> None:
     export(hostile, "sb3", tmp_path / "one.py")
     assert repr(hostile.about["env"]) in (tmp_path / "one.py").read_text()
     hostile.about["env"] = "os:Pendulum-v1"
-    with pytest.raises(UsageError, match="allow it with --env"):
+    with pytest.raises(UsageError, match="allow it with --allow"):
         export(hostile, "sb3", tmp_path / "two.py")

@@ -384,7 +384,9 @@ def test_failure_is_reported(
     assert "0 of 1 runs finished, 0 of them before; 1 failed" in printed.out
     assert printed.err.splitlines()[-1] == f"pacesetter: {PROBE} td3 seed 0: exit 2: the fault"
     text = (jobs[0].directory.path / "failure.log").read_text()
-    assert re.fullmatch(r"\$ resume runs/\S+ -q\na line\npacesetter: the fault\n", text)
+    assert re.fullmatch(
+        rf"\$ resume runs/\S+ --allow {PROBE} -q\na line\npacesetter: the fault\n", text
+    )
 
 
 def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
@@ -538,7 +540,7 @@ def test_printed_commands(
     subprocess.run(["bash", "-c", lines[1]], check=True)
     train, resume = program.read_text().splitlines()
     assert train == " ".join(["1 -m pacesetter", *jobs[1].words, "-q"])
-    assert resume == f"1 -m pacesetter resume {jobs[1].directory.path} -q"
+    assert resume == f"1 -m pacesetter resume {jobs[1].directory.path} --allow {PROBE} -q"
 
 
 def test_printed_job_array(
@@ -582,7 +584,7 @@ def test_finished_runs_are_not_printed(jobs: list[Job], capsys: pytest.CaptureFi
 
 def start(*words: str) -> subprocess.Popen[str]:
     """A bench as a process of its own."""
-    command = [sys.executable, "-m", "pacesetter", "bench", *words]
+    command = [sys.executable, "-m", "pacesetter", "bench", *words, "--allow", PROBE]
     return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 

@@ -15,7 +15,10 @@ from pacesetter.study.bench import suite as suites
 from pacesetter.study.bench.suite import Suite
 from pacesetter.tracking import chosen
 
-OWN = ("algos", "jobs", "executor", "address", "print", "runs", "log", "quiet", "env.KEY")
+OWN = (
+    *("algos", "jobs", "executor", "address", "print", "runs", "log", "quiet", "env.KEY"),
+    "allow",
+)
 
 
 def bench(words: list[str]) -> int:
@@ -37,6 +40,8 @@ def _parse(words: list[str]) -> tuple[Suite, Settings, dict[str, Any]]:
     first, _ = command.parse_known_args([word for word in rest if word not in ("-h", "--help")])
     suite = _suite(name, first.algos) if name or first.algos else None
     if suite is not None:
+        named = [*first.allow, *(first.algos or [])]
+        suites.require_named(suite, named, vars(first).get("envs", []))
         _add_settings_of(suite, command)
     found = vars(command.parse(rest))
     if suite is None:
@@ -70,6 +75,7 @@ def _parser(name: str | None) -> Parser:
     address = "address of a running Ray cluster, such as auto (default a new one)"
     add("--address", metavar="A", help=address)
     add("--print", choices=("commands", "slurm"), help="print the remaining runs, start none")
+    command.add_allow()
     command.add_runs()
     command.add_log()
     command.add_quiet()

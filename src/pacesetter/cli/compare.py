@@ -9,7 +9,7 @@ def compare(words: list[str]) -> int:
     from pacesetter.study.compare.comparison import compare
     from pacesetter.study.report import output
 
-    options = output.Options(found.published, found.smooth, not found.no_film)
+    options = output.Options(found.published, found.smooth, not found.no_film, tuple(found.allow))
     paths = output.check(found.o, options)
     comparison = compare(
         found.run,
@@ -46,5 +46,6 @@ def _parser() -> Parser:
     add("--no-film", action="store_true", help="leave the video out of the report")
     output = "write a .html report, .md or .tex tables, or .pdf curves; may be repeated"
     add("-o", action="append", default=[], metavar="FILE", help=output)
+    command.add_allow()
     command.add_runs()
     return command

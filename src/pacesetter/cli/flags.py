@@ -5,6 +5,7 @@ import tomllib
 from collections.abc import Collection
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
+from pacesetter import consent
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
@@ -40,6 +41,14 @@ class Parser(argparse.ArgumentParser):
         """`--runs`, the folder of all runs."""
         about = f"folder of runs (default {RUNS})"
         self.add_argument("--runs", default=RUNS, metavar="DIR", help=about)
+
+    def add_allow(self) -> None:
+        """`--allow`, for verbs that read names of tasks or algorithms from files."""
+        about = (
+            "import the module of NAME, such as module:Id-v0, which a file names and you trust; "
+            "may be repeated"
+        )
+        self.add_argument(consent.FLAG, action="append", default=[], metavar="NAME", help=about)
 
     def add_quiet(self) -> None:
         """`--quiet`, for verbs that show progress."""

@@ -17,7 +17,7 @@ RUN = "run folder, the end of its path, a policy file, or champion:NAME"
 
 
 class Found(NamedTuple):
-    """A policy, its file, and the task and keywords to play it with."""
+    """A policy, its file, and the task and keywords to play it with; a task only if it is named."""
 
     policy: "Policy"
     file: Path
@@ -35,6 +35,7 @@ def add_run(command: Parser) -> None:
     command.add_argument("run", metavar="RUN|FILE", help=RUN)
     command.add_argument("--env", metavar="ID", help="task to play (default the policy's own)")
     command.add_env_keywords()
+    command.add_allow()
     command.add_runs()
 
 
@@ -52,30 +53,27 @@ def parse(command: Parser, words: list[str]) -> tuple[Namespace, Found]:
     given = command.parse(words)
     if getattr(given, "seed", 0) < 0:
         raise UsageError(f"seed: must be at least 0, got {given.seed}")
-    file, env = policy_file(given.run, given.env, given.runs)
+    file = policy_file(given.run, given.runs)
     policy = load(file)
     own = policy.about.get("env")
+    env = given.env or (own if own in given.allow else None)
     if (env or own) == own:
         env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
     return given, Found(policy, file, env, env_kwargs)
 
 
-def policy_file(run: str, env: str | None, runs: str) -> tuple[Path, str | None]:
-    """The policy file that is meant, and the task if it is named or a run's own.
-
-    A run is of this machine, so its task is trusted; a file's task may import a module only if
-    `env` names it.
-    """
+def policy_file(run: str, runs: str) -> Path:
+    """The policy file that is meant."""
     from pacesetter.runs import find
 
     if run.startswith(CHAMPION):
-        return champion(run.removeprefix(CHAMPION)), env
+        return champion(run.removeprefix(CHAMPION))
     if Path(run).suffix == ".safetensors":
-        return Path(run), env
+        return Path(run)
     found = find(run, runs)
     if not found.policy_file.exists():
         raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")
-    return found.policy_file, env or found.settings()["env"]
+    return found.policy_file
 
 
 def champion(name: str) -> Path:

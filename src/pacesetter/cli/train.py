@@ -1,11 +1,13 @@
 """The verbs `train` and `resume`."""
 
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pacesetter import consent
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
 from pacesetter.process import exit_code, fix_threads, stopping
@@ -83,6 +85,7 @@ def _resumed_trainer(words: list[str]) -> Command:
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
     command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
     command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
+    command.add_allow()
     command.add_runs()
     command.add_log()
     command.add_quiet()
@@ -92,8 +95,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    trainer = Trainer.resume(directory.path, steps=found.steps, time=found.time)
-    return Command(trainer, found.quiet, log)
+    given = {"steps": found.steps, "time": found.time, "allow": found.allow}
+    return Command(Trainer.resume(directory.path, **given), found.quiet, log)
 
 
 def name_of(path: Path) -> str:
@@ -131,10 +134,12 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     result = f", return {final.values['mean']:.1f} at step {final.step:,}" if final else ""
     print(f"{run.env} {run.name} seed {run.seed}: {step:,} steps{result}")
     if received and not trainer.finished:
-        print(f"saved; go on with `pacesetter resume {trainer.directory.path}`")
+        words = trainer.directory.resume_words(trainer.config)
+        print(f"saved; go on with `pacesetter {shlex.join(words)}`")
         return exit_code(received)
     called = name_of(trainer.directory.path)
     print(f"policy: {trainer.directory.policy_file}")
     print(f"run: {called}, a name for show, eval, record, resume and compare")
-    print(f"watch it: `pacesetter record {called} -o walk.mp4`")
+    film = ["record", called, "-o", "walk.mp4", *consent.words(run.env)]
+    print(f"watch it: `pacesetter {shlex.join(film)}`")
     return 0

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from pacesetter.consent import require
 from pacesetter.errors import UsageError
 from pacesetter.policy import Floats, Policy
 from pacesetter.storage import write_atomically
@@ -60,10 +61,7 @@ def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
     name = env or policy.about.get("env")
     if name is None:
         raise UsageError("env: none given and the policy names none")
-    if env is None and ":" in name:
-        raise UsageError(
-            f"env: the file names '{name}', which imports a module; allow it with --env {name}"
-        )
+    require("env", name, [env], loaded=())  # the script will run in another process
     file = path.with_suffix(".safetensors")
     if file.exists():
         raise UsageError(f"sb3: {file} exists; give {path.name} another name")

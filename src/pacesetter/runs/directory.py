@@ -5,12 +5,15 @@ import json
 import os
 import platform
 import re
+import shlex
 import shutil
+from collections.abc import Iterable
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config, resolve
+from pacesetter.consent import require, words
 from pacesetter.errors import InUseError, UsageError
 from pacesetter.runs.provenance import provenance
 from pacesetter.settings.validation import difference
@@ -55,19 +58,25 @@ class RunDirectory:
         if not self.config_file.exists():
             self._refuse_other_seeds(config)
             return
-        resume = f"go on with `pacesetter resume {self.path}`"
+        resume = f"go on with `pacesetter {shlex.join(self.resume_words(config))}`"
         if found := self.difference_from(config):
             raise UsageError(
                 f"run: {self.path} exists with {found}; give this one another --name, or {resume}"
             )
         raise UsageError(f"run: {self.path} exists; {resume}")
 
+    def resume_words(self, config: Config) -> list[str]:
+        """The command that goes on with this run, with consent to what the run itself names."""
+        return ["resume", str(self.path), *words(config.run.algorithm, config.run.env)]
+
     def difference_from(self, config: Config) -> str | None:
         """The first setting in which the run here differs; None if none does, or no run is here."""
         if not self.config_file.exists():
             return None
-        old, new = self.config().settings(), config.settings()
-        return difference(old, new, new)
+        old, new, own = self.settings(), config.settings(), ("algorithm", "env")
+        if found := difference(old, new, own):  # a name of the file's own is not even looked up
+            return found
+        return difference(self.config([new[name] for name in own]).settings(), new, new)
 
     def _refuse_other_seeds(self, config: Config) -> None:
         """Refuse a new seed whose settings differ from those of the other seeds of its name."""
@@ -141,9 +150,11 @@ class RunDirectory:
         """The run's flat settings."""
         return self.record()["settings"]
 
-    def config(self) -> Config:
-        """The run's checked settings."""
+    def config(self, allow: Iterable[str] = ()) -> Config:
+        """The run's checked settings; `allow` are names that may import a module."""
         settings = self.settings()
+        for name in ("algorithm", "env"):
+            require(name, settings[name], allow)
         try:
             return resolve(settings["algorithm"], settings["env"], settings)
         except KeyError as error:

@@ -1,6 +1,6 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -67,11 +67,15 @@ class Trainer:
         runs: str | Path = "runs",
         steps: int | str | None = None,
         time: float | str | None = None,
+        allow: Iterable[str] = (),
     ) -> Self:
-        """Take up a run where its last checkpoint left it, with a new budget if one is given."""
+        """Take up a run where its last checkpoint left it, with a new budget if one is given.
+
+        `allow` are names in its config that may import a module.
+        """
         self = cls.__new__(cls)
         self.directory = find(str(run), runs)
-        self.config = self.directory.config()
+        self.config = self.directory.config(allow)
         budgets = {"steps": steps, "time": time}
         changed = {key: value for key, value in budgets.items() if value is not None}
         if changed:

@@ -134,11 +134,11 @@ def commands(jobs: Iterable[Job]) -> list[str]:
     program = f"{alone} exec {shlex.quote(sys.executable)} -m pacesetter"
     lines: list[str] = []
     for job in jobs:
-        path = shlex.quote(str(job.directory.path))
+        resume = shlex.join(job.directory.resume_words(job.config))
         config = shlex.quote(str(job.directory.config_file))
         train, always = shlex.join(job.words), shlex.join([*job.always, "-q"])
         lines.append(
-            f"if [ -e {config} ]; then {program} resume {path} {always}; "
+            f"if [ -e {config} ]; then {program} {resume} {always}; "
             f"else {program} {train} {always}; fi"
         )
     return lines

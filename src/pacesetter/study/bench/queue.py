@@ -67,7 +67,7 @@ def is_finished(job: Job) -> bool:
 def words_of(job: Job) -> list[str]:
     """The command that continues a run: `resume` if its folder holds one, else `train`."""
     if job.directory.config_file.exists():
-        return ["resume", str(job.directory.path), *job.always, "-q"]
+        return [*job.directory.resume_words(job.config), *job.always, "-q"]
     return [*job.words, *job.always, "-q"]
 
 

@@ -1,13 +1,14 @@
 """What to run: entries x envs x seeds of a suite file, or of flags, as one checked job per run."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pacesetter.config import Config, resolve
+from pacesetter.consent import require
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
@@ -74,6 +75,18 @@ def of_algorithms(names: Iterable[str]) -> Suite:
     """A suite of algorithms or presets as they are."""
     entries: dict[str, Settings] = {name.replace(":", "-"): {"algorithm": name} for name in names}
     return Suite("bench", "", {}, entries, Path())
+
+
+def require_named(suite: Suite, allow: Collection[str], envs: Collection[str]) -> None:
+    """Refuse names in the suite's file that import a module and are not allowed.
+
+    If the command line gives `envs`, the file's own are not used.
+    """
+    for name, entry in suite.entries.items():
+        require("algorithm", entry.get("algorithm", name), allow)
+        merged = suite.shared | entry
+        for env in _envs(merged["envs"]) if "envs" in merged and not envs else ():
+            require("env", env, allow)
 
 
 def pick(suite: Suite, names: Iterable[str]) -> Suite:

@@ -4,7 +4,7 @@ import base64
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -49,9 +49,17 @@ class Descent(NamedTuple):
 
 
 def report(
-    comparison: Comparison, tables: Iterable[Table], *, window: int | None = None, film: bool = True
+    comparison: Comparison,
+    tables: Iterable[Table],
+    *,
+    window: int | None = None,
+    film: bool = True,
+    allow: Collection[str] = (),
 ) -> str:
-    """The page. Tables in order; curves smoothed over a window of evaluations if one is given."""
+    """The page. Tables in order; curves smoothed over a window of evaluations if one is given.
+
+    Films are of the tasks that import no module, and of those that `allow` names.
+    """
     library = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -73,7 +81,7 @@ def report(
         smoothed=f"Savitzky-Golay, window {window}, order {SMOOTHING_ORDER}" if window else "",
         figure_2=Markup(svg(drawn)) if drawn is not None else "",
         descents=list(_descents(comparison)),
-        films=[_film(run) for run in _champions(comparison)] if film else [],
+        films=[_film(run, allow) for run in _champions(comparison)] if film else [],
         command=shlex.join(["pacesetter", *sys.argv[1:]]),
         own=", ".join(f"{name} {number}" for name, number in versions().items()),
         style=Markup((HERE / "report.css").read_text()),
@@ -141,7 +149,7 @@ def _champions(comparison: Comparison) -> Iterable[Run]:
         yield max(runs, key=lambda run: run.metric("final"))
 
 
-def _film(run: Run) -> Film:
+def _film(run: Run, allow: Collection[str]) -> Film:
     """The policy that a run ended with."""
     what = f"{run.env}: {run.name} seed {run.seed}"
     if run.folder is None:
@@ -153,7 +161,9 @@ def _film(run: Run) -> Film:
         policy = load(run.folder / "policy.safetensors")
         with TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            record(policy, path, frames=FILM_FRAMES, size=FILM_SIZE)
+            own = policy.about.get("env")
+            env = own if own in allow else None
+            record(policy, path, env=env, frames=FILM_FRAMES, size=FILM_SIZE)
             data = base64.b64encode(path.read_bytes()).decode()
     except UsageError as error:
         return Film(f"{what}: no film: {error}")

@@ -20,6 +20,7 @@ class Options:
     published: bool = False
     smooth: int | None = None
     film: bool = True
+    allow: tuple[str, ...] = ()  # names of tasks that may import a module, to be filmed
 
 
 def check(paths: list[str], options: Options) -> list[Path]:
@@ -64,7 +65,8 @@ def _page(comparison: Comparison, suffix: str, options: Options) -> str:
     if suffix == ".html":
         from pacesetter.study.report.html import report
 
-        return report(comparison, shown, window=options.smooth, film=options.film)
+        film, allow = options.film, options.allow
+        return report(comparison, shown, window=options.smooth, film=film, allow=allow)
     heading, notes = contents.title(comparison), comparison.notes
     shown.append(contents.runs(comparison))
     if suffix == ".md":

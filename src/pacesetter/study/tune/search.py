@@ -171,7 +171,7 @@ class Tuning:
         if not directory.config_file.exists():
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
-            trainer = Trainer.resume(directory.path)
+            trainer = Trainer.resume(directory.path, allow=[self.algorithm, self.env])
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:

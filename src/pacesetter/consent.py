@@ -1,0 +1,37 @@
+"""Consent: a name that a file gives imports no module, unless the command line names it too."""
+
+import sys
+from collections.abc import Container, Iterable
+
+from pacesetter.errors import UsageError
+
+FLAG = "--allow"
+
+
+def require(
+    kind: str,
+    name: str,
+    allowed: Iterable[str | None] = (),
+    loaded: Container[str] = sys.modules,
+) -> None:
+    """Refuse a name from a file, such as `module:Id-v0`, that would import a module unasked.
+
+    `allowed` are the names that the caller gave himself. A module that is `loaded` already, as by
+    a Python program that uses it, is not imported again. Raises UsageError.
+    """
+    module, colon, _ = _base(name).partition(":")
+    if not colon or module in loaded or _base(name) in map(_base, filter(None, allowed)):
+        return
+    raise UsageError(
+        f"{kind}: a file names '{name}', which would import a module, and so run its code; "
+        f"if you trust it, allow it with {FLAG} {name}"
+    )
+
+
+def words(*names: str) -> list[str]:
+    """The flags that allow those of the names that import a module."""
+    return [word for name in names if ":" in name for word in (FLAG, name)]
+
+
+def _base(name: str) -> str:
+    return name.removeprefix("multi-")
