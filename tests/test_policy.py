@@ -18,7 +18,7 @@ from pacesetter.envs import make
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.networks import mlp
-from pacesetter.policy import Actors, Policy, load, unstack
+from pacesetter.policy import Policy, load, unstack
 from pacesetter.training.trainer import Trainer
 from pacesetter.types import Layers
 
@@ -160,7 +160,7 @@ def test_stacked_actors_come_apart(rng: np.random.Generator) -> None:
         {name: np.stack([layers[i][name] for layers in actors]) for name in ("kernel", "bias")}
         for i in range(2)
     ]
-    for mine, found in zip(actors, unstack(Actors(stacked, "relu", "tanh")), strict=True):
+    for mine, found in zip(actors, unstack(stacked), strict=True):
         for one, other in zip(mine, found, strict=True):
             assert all(np.array_equal(one[name], other[name]) for name in one)
 

@@ -153,13 +153,13 @@ class Policy:
         storage.write(Path(path), KIND, storage.Content(arrays, table))
 
 
-def unstack(actors: Actors) -> list[Layers]:
-    """Plain NumPy layers of each actor, copied out of whatever holds them."""
-    count = np.asarray(actors.layers[0]["kernel"]).shape[0]
+def unstack(stacked: Any) -> list[Layers]:
+    """Plain NumPy layers of each of N actors, copied out of the `layers` of `Actors`."""
+    count = np.asarray(stacked[0]["kernel"]).shape[0]
     return [
         [
             {name: np.array(value[n], np.float32) for name, value in layer.items()}
-            for layer in actors.layers
+            for layer in stacked
         ]
         for n in range(count)
     ]

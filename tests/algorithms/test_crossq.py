@@ -262,7 +262,7 @@ def test_policy_and_acting_are_plain_networks(rng: np.random.Generator) -> None:
     observation = rng.normal(size=(20, 3)).astype(np.float32)
     mean, log_std = np.split(evaluate(state.actor, observation), 2, axis=1)
     actors, box = algorithm.policy(state), np.ones(2, np.float32)
-    policy = Policy(unstack(actors), actors.activation, actors.output, -box, box)
+    policy = Policy(unstack(actors.layers), actors.activation, actors.output, -box, box)
     np.testing.assert_allclose(policy(observation), np.tanh(mean), atol=1e-5)
     params = jax.device_get(jax.jit(algorithm.policy_params)(state))
     noise = np.random.default_rng(1).standard_normal(2, np.float32)

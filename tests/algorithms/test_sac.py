@@ -237,7 +237,7 @@ def test_policy_is_the_mean(rng: np.random.Generator) -> None:
     state = jax.tree.map(np.float32, random_state(algorithm, rng, "actor"))
     actors = algorithm.policy(state)
     box = np.ones(2, np.float32)
-    policy = Policy(unstack(actors), actors.activation, actors.output, -box, box)
+    policy = Policy(unstack(actors.layers), actors.activation, actors.output, -box, box)
     observation = rng.normal(size=(20, 3)).astype(np.float32)
     expected = np.tanh(perceptron(state.actor, observation)[:, :2])
     np.testing.assert_allclose(policy(observation), expected, atol=1e-6)

@@ -398,7 +398,7 @@ def test_policy_file_averages_actions(name: str, tmp_path: Path, rng: Any) -> No
     state = jax.tree.map(lambda x: 2 * x, begin(ours))
     actors = ours.policy(state)
     low, high = np.full(2, -1, np.float32), np.full(2, 1, np.float32)
-    layers = unstack(actors)
+    layers = unstack(actors.layers)
     policy = Policy(layers, actors.activation, actors.output, low, high)
     policy.save(tmp_path / "policy.safetensors")
     observation = rng.normal(size=(20, 3)).astype(np.float32)

@@ -587,7 +587,7 @@ def test_policy_file_acts_as_the_learner(
     deviation = np.array([2, 3, 0.3], np.float32)  # by which the last one is often cut at +-10
     low, high = np.array([-0.4, 0], np.float32), np.array([0.4, 5], np.float32)
     actors = algorithm.policy(state)
-    layers = unstack(actors)
+    layers = unstack(actors.layers)
     policy = Policy(layers, actors.activation, actors.output, low, high, (mean, deviation))
     policy.save(tmp_path / "policy.safetensors")
     loaded = load(tmp_path / "policy.safetensors")

@@ -410,7 +410,7 @@ def test_policy_file_acts_as_the_learner(rng: np.random.Generator, tmp_path: Pat
 
     expected = np.asarray(jax.jit(wanted)(state))
     actors, box = algorithm.policy(state), np.ones(2, np.float32)
-    Policy(unstack(actors), actors.activation, actors.output, -box, box).save(tmp_path / "p")
+    Policy(unstack(actors.layers), actors.activation, actors.output, -box, box).save(tmp_path / "p")
     policy = load(tmp_path / "p")
     np.testing.assert_allclose(policy(observation), expected, atol=1e-5)
     params = jax.device_get(jax.jit(algorithm.policy_params)(state))
@@ -425,7 +425,10 @@ def test_policy_file_acts_as_the_learner(rng: np.random.Generator, tmp_path: Pat
 def test_a_damaged_encoder_is_refused(name: str, rng: np.random.Generator, tmp_path: Path) -> None:
     """A stage of the wrong shape, or with a part missing, is one line."""
     algorithm = learner()
-    layers, box = unstack(algorithm.policy(floats(fresh(algorithm, rng)))), np.ones(2, np.float32)
+    layers, box = (
+        unstack(algorithm.policy(floats(fresh(algorithm, rng))).layers),
+        np.ones(2, np.float32),
+    )
     first = layers[0][0]
     cut = first | {name: first[name][:-1]}
     missing = {key: value for key, value in first.items() if key != name}

@@ -15,7 +15,7 @@ SMALL: dict[str, Any] = {"hidden": (8,), "steps": 300, "eval_every": 150}
 PARAMETER: dict[str, Any] = {"exploration": "parameter", "actor_layer_norm": True}
 RUNS: dict[str, dict[str, Any]] = {
     "multi-td3": PARAMETER | {"assess": 1, "rule": "best"},
-    "td3": {"members": 2, "rule": "none"},
+    "td3": {"members": 2, "rule": "none", "snapshots": 2},
     "sac": {},
     "crossq": {"critic_hidden": (8,)},
     "sunrise": {"ensemble": 2},

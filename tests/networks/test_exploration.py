@@ -149,7 +149,7 @@ def test_policy_is_clean(rng: np.random.Generator) -> None:
     """What is evaluated and written is the actor itself."""
     algorithm = learner()
     state = new_state(algorithm, rng)
-    (layers,) = unstack(algorithm.policy(state))
+    (layers,) = unstack(algorithm.policy(state).layers)
     assert same(layers, list(state.actor))
 
 

@@ -15,7 +15,7 @@ from pacesetter.training.trainer import Trainer
 MODELS = {"model_hidden": (8,), "head_hidden": (8,), "critic_members": 2}
 CASES = {
     "td3": {"env": "HalfCheetah-v5"},
-    "multi-td3": {"env": "HalfCheetah-v5", "steps": 3_300},
+    "multi-td3": {"env": "HalfCheetah-v5", "steps": 3_300, "snapshots": 2},
     "multi-ant": {"env": "Ant-v5", "algorithm": "multi-td3", "members": 3},
     "wrapped": {"env": "Hopper-v5", "algorithm": "multi-td3", "replay_size": 300},
     "ou": {"env": "Hopper-v5", "algorithm": "ddpg", "exploration": "ou", "members": 2},

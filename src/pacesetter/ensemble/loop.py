@@ -51,6 +51,10 @@ class Loop(Protocol):
         """What a member is evaluated by."""
         ...
 
+    def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
+        """Policies whose mean action is evaluated beside the champion's, by name."""
+        ...
+
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""
         ...

@@ -13,6 +13,7 @@ import numpy as np
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
 from pacesetter.config import Config
+from pacesetter.ensemble.averages import Averages
 from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.ensemble.explorer import Explorer
 from pacesetter.ensemble.loop import Part, numbered
@@ -26,7 +27,7 @@ from pacesetter.learner.learners import Learners
 from pacesetter.learner.normalizer import Normalizer
 from pacesetter.learner.schedule import factors
 from pacesetter.policy import Policy
-from pacesetter.replay.buffer import Replay, Sample, make_sampler
+from pacesetter.replay.buffer import Replay, Sample, open_replays
 from pacesetter.replay.n_step import NStepQueue
 from pacesetter.seeding import Stream, generator
 
@@ -45,9 +46,8 @@ class Members:
         self.updates_per_call = learner.updates_per_call
         self.budget = config.budget
         self.normalizer = Normalizer(spec.observation_size, hyper.normalize_observation)
-        compiled = CompiledLearner(
-            learner, layout, run.seed, self.normalizer.enabled, hyper.precision
-        )
+        normalize = self.normalizer.enabled
+        compiled = CompiledLearner(learner, layout, run.seed, normalize, hyper.precision)
         self.learners = Learners(compiled, run.members, run.seed, run.same_init)
         # Env n of member k has the number n K + k.
         self.explorers = [
@@ -58,16 +58,14 @@ class Members:
         self.replays: list[Replay] = []
         self.selector = Selector(config, self.budget)
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
+        self.averages = Averages(run, self.learners, self.current_policy(0))
         self.progress = Progress.of(run.members)
 
     def open_replays(self, folder: Path) -> None:
-        """Make or find the rings, whose files take their whole space at once."""
-        run, size = self.config.run, self.config.hyper.replay_size
-        for i in range(1 if run.replay_scope == "shared" else run.members):
-            sampler = make_sampler(self.config.hyper, min(size, self.budget))
-            path = folder / f"replay-{i}.bin"
-            layout = self.learners.compiled.layout
-            self.replays.append(Replay(path, layout, size, self.budget, sampler))
+        """Make or find the rings."""
+        run, layout = self.config.run, self.learners.compiled.layout
+        count = 1 if run.replay_scope == "shared" else run.members
+        self.replays = open_replays(folder, count, layout, self.config.hyper, self.budget)
 
     def tick(self) -> Selection | None:
         """One tick; the selection, if it made one."""
@@ -93,6 +91,12 @@ class Members:
     def policy(self, member: int) -> Policy:
         """A member's policy: the best that was kept, if any was, or as it is now."""
         return self.policy_checkpoints.policy(member) or self.current_policy(member)
+
+    def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
+        """Policies whose mean action is evaluated beside the champion's; it joins the snapshots."""
+        members = range(self.config.run.members)
+        now = [self.current_policy(k) for k in members]
+        return self.averages.policies(champion, [self.policy(k) for k in members], now)
 
     def current_policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
@@ -188,25 +192,23 @@ class Members:
         statistics, samples = self.normalizer.statistics(), [self._sample(k) for k in members]
         inputs: list[Any] = []
         for k, sample in zip(members, samples, strict=True):
-            call, scales = self.progress.members[k].update_calls, self.progress.members[k].scales
-            made = call * self.updates_per_call
-            scales = factors(self.config.hyper, scales, made, self.config.lr_updates)
-            inputs.append((call, sample.rows, sample.weight, statistics, None, scales))
+            member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
+            made = member.update_calls * self.updates_per_call
+            scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
+            inputs.append((member.update_calls, *data, None, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):
             self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
             self.replay(k).feedback(sample.numbers, np.asarray(result.td_error))
             self.progress.members[k].update_calls += 1
+            self.averages.follow(k)
 
     def _sample(self, k: int) -> Sample:
         hyper, progress = self.config.hyper, self.progress
-        updates = self.updates_per_call
-        progress.members[k].updates_due -= updates
-        progress.updates += updates
-        progress.transitions += updates * hyper.batch_size
+        progress.begin_updates(k, self.updates_per_call, hyper.batch_size)
         horizon = (hyper.replay_horizon or 0) * self.config.steps_per_count
         done = min(progress.step / horizon, 1.0) if horizon else 1.0
-        shape = (updates, hyper.batch_size)
+        shape = (self.updates_per_call, hyper.batch_size)
         return self.replay(k).sample(self.learners.sample_streams[k], shape, done)
 
     # End a round.
@@ -239,6 +241,7 @@ class Members:
         states = copy_from_parents(learner, self.learners.states, parents, copy, weights)
         self.learners.replace(states)
         self.policy_checkpoints.copy(parents)
+        self.averages.copy(selection.choice)
         self.progress.copy(selection.choice)
         self.progress.champion = selection.champion
 
@@ -250,6 +253,7 @@ class Members:
             "progress": self.progress,
             "selector": self.selector,
             "kept": self.policy_checkpoints,
+            "averages": self.averages,
             **numbered("queue", self.queues),
             **numbered("replay", self.replays),
             **numbered("env", self.explorers),

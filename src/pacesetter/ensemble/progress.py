@@ -93,6 +93,12 @@ class Progress:
         self.episodes += 1
         self.ended.append([member, total, length])
 
+    def begin_updates(self, member: int, updates: int, batch_size: int) -> None:
+        """Count updates of a member that fell due and are made now."""
+        self.members[member].updates_due -= updates
+        self.updates += updates
+        self.transitions += updates * batch_size
+
     def add_losses(self, names: Sequence[str], losses: Floats, who: str = "") -> None:
         """Add the losses of one update to what the next row averages, if all are finite."""
         for name, loss in zip(names, losses.tolist(), strict=True):

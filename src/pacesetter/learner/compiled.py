@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from optax import incremental_update
 
 from pacesetter.algorithms.contract import Array, Learner, State
 from pacesetter.batch import Layout
@@ -62,6 +63,10 @@ class CompiledLearner:
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: learner.init(_key(key, KeyUse.INIT, 0, member)))
         self._policy_params = jax.jit(learner.policy_params)
+        self._actors = jax.jit(lambda state: learner.policy(state).layers)
+        self._ema_actors = jax.jit(
+            lambda ema, state, tau: incremental_update(learner.policy(state).layers, ema, tau)
+        )
         self._fold = jax.jit(self._fold_keys)
         self._keys = lru_cache(maxsize=1024)(self._make_keys)
         update = self._update_one
@@ -112,11 +117,19 @@ class CompiledLearner:
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))
 
+    def actors(self, state: State) -> Any:
+        """The layers of what acts without noise."""
+        return self._actors(state)
+
+    def ema_actors(self, ema: Any, state: State, tau: float) -> Any:
+        """Such layers, a step of size `tau` nearer to what they are in a state now."""
+        return self._ema_actors(ema, state, tau)
+
     def policy(self, state: State, env: Environment, statistics: Statistics) -> Policy:
         """What acts without noise in an env like this one, in NumPy alone."""
         actors = self.learner.policy(state)
         scale = statistics if self.normalize else None
-        layers = unstack(actors)
+        layers = unstack(actors.layers)
         return Policy(
             layers, actors.activation, actors.output, env.low, env.high, scale,
             shapes=(env.observation_shape, env.action_shape),

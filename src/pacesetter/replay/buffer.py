@@ -158,6 +158,17 @@ def make_sampler(hyper: Any, size: int) -> Sampler:
     return ByError(size, exponent, importance, MEASURES[hyper.replay])
 
 
+def open_replays(folder: Path, count: int, layout: Layout, hyper: Any, budget: int) -> list[Replay]:
+    """Make or find rings, each in a file of its own, which takes its whole space at once."""
+    size = hyper.replay_size
+    return [
+        Replay(
+            folder / f"replay-{i}.bin", layout, size, budget, make_sampler(hyper, min(size, budget))
+        )
+        for i in range(count)
+    ]
+
+
 def _map_file(path: Path, size: int) -> mmap.mmap:
     try:
         path.parent.mkdir(exist_ok=True)

@@ -73,6 +73,23 @@ class Ensemble:
     replay_scope: Literal["shared", "member"] = Field(
         "shared", description="one shared replay, or one per member"
     )
+    mean_actions: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="also evaluate the mean action of all members and that of their EMA actors; "
+        "auto: of several members",
+    )
+    ema_tau: float = Field(0.005, gt=0, le=1, description="step of the EMA actors per actor update")
+    snapshots: int = Field(
+        0,
+        ge=0,
+        le=100,
+        description="last evaluated champions whose mean action is evaluated too; 0 evaluates none",
+    )
+
+    @property
+    def evaluates_means(self) -> bool:
+        """Whether the mean actions of members and of their EMA actors are evaluated."""
+        return self.mean_actions == "on" or (self.mean_actions == "auto" and self.members > 1)
 
     @property
     def window(self) -> int:

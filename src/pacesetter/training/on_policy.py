@@ -87,6 +87,10 @@ class OnPolicyLoop:
         """The policy as it is now."""
         return self.learners.policy(member, self.explorers[0].env, self.normalizer.statistics())
 
+    def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
+        """None: there is one member."""
+        return {}
+
     def collect(self, steps: int) -> Floats:
         """Rows (steps, width) of that many steps, the envs in turn."""
         rows = np.empty((steps, self.layout.width), np.float32)

@@ -11,18 +11,17 @@ from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
-from pacesetter.errors import TrainingError, UsageError, blame
-from pacesetter.evaluation import Evaluation, rollouts
+from pacesetter.errors import TrainingError, UsageError
 from pacesetter.learner import products
 from pacesetter.learner.backend import prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
-from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import out_of_time
 from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint
+from pacesetter.training.evaluator import Evaluator
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
 
@@ -107,7 +106,7 @@ class Trainer:
         ]
         self.notes = envs[0].check()
         self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
-        self._evaluation_env: Environment | None = None
+        self._evaluator = Evaluator(self.loop, self.config, self.directory)
         self._reports: list[Report] = []
         self._stopping = self._closed = False
         self._clock = Clock()
@@ -176,8 +175,7 @@ class Trainer:
         self._closed = True
         try:
             self.loop.close()
-            if self._evaluation_env is not None:
-                self._evaluation_env.close()
+            self._evaluator.close()
         finally:
             self.directory.unlock()
 
@@ -188,12 +186,7 @@ class Trainer:
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
-        policy = self.loop.policy(self.progress.champion if member is None else member)
-        run = self.config.run
-        names = ("env", "env_kwargs", "algorithm", "name", "seed")
-        policy.about.update({name: getattr(run, name) for name in names})
-        policy.about.update(step=self.progress.step, versions=versions())
-        return policy
+        return self._evaluator.policy(member)
 
     def ledger(self) -> dict[str, Any]:
         """What the run has spent."""
@@ -211,36 +204,10 @@ class Trainer:
         last = ending and progress.last_evaluation < progress.step
         # The last one waits for all updates that the budget's last steps made due.
         if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
-            self._evaluate(ending)
+            self._emit("eval", self._evaluator.evaluate(ending))
             every = self.config.run.eval_every * self.config.steps_per_count
             progress.last_evaluation = progress.step
             progress.next_evaluation = (progress.step // every + 1) * every
-
-    def _evaluate(self, ending: bool) -> None:
-        """Evaluate the champion on starts of its own and write the policy files."""
-        run, progress = self.config.run, self.progress
-        policy = self.policy()
-        trial = self._trial(policy, progress.champion)
-        score = {"score": trial.mean, "score_std": trial.std, "score_episodes": run.eval_episodes}
-        policy.about.update(score)
-        policy.save(self.directory.policy_file)
-        if progress.step > 0 and (progress.best is None or trial.mean > progress.best):
-            progress.best = trial.mean
-            policy.about["score_note"] = "the best of many evaluations, so biased upwards"
-            policy.save(self.directory.best_file)
-        values = trial.table() | {"champion": progress.champion}
-        if ending and run.rule == "none" and run.members > 1:
-            values["members"] = [self._trial(self.policy(k), k).mean for k in range(run.members)]
-        self._emit("eval", values)
-
-    def _trial(self, policy: Policy, member: int) -> Evaluation:
-        run, progress = self.config.run, self.progress
-        env = self._evaluation_env or Environment(
-            run.env, run.env_kwargs, run.seed, Stream.EVALUATE
-        )
-        self._evaluation_env = env
-        with blame(member, progress.step):
-            return rollouts(policy.act, env, run.eval_episodes)
 
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)

@@ -1,0 +1,75 @@
+"""Evaluations of a run on starts that training never uses, and the policy files they write."""
+
+from typing import Any
+
+from pacesetter.config import Config
+from pacesetter.ensemble.averages import mean_action
+from pacesetter.ensemble.loop import Loop
+from pacesetter.envs import Environment
+from pacesetter.errors import blame
+from pacesetter.evaluation import Act, Evaluation, rollouts
+from pacesetter.policy import Policy
+from pacesetter.runs import RunDirectory
+from pacesetter.runs.provenance import versions
+from pacesetter.seeding import Stream
+
+
+class Evaluator:
+    """Rolls out the champion of a loop, its other members, and their mean actions."""
+
+    def __init__(self, loop: Loop, config: Config, directory: RunDirectory) -> None:
+        self.loop, self.config, self.directory = loop, config, directory
+        self._env: Environment | None = None
+
+    def policy(self, member: int | None = None) -> Policy:
+        """The policy of the champion, or of a member, as it is now, and where it comes from."""
+        progress, run = self.loop.progress, self.config.run
+        policy = self.loop.policy(progress.champion if member is None else member)
+        names = ("env", "env_kwargs", "algorithm", "name", "seed")
+        policy.about.update({name: getattr(run, name) for name in names})
+        policy.about.update(step=progress.step, versions=versions())
+        return policy
+
+    def evaluate(self, ending: bool) -> dict[str, Any]:
+        """Evaluate the champion and write its policy files; the values of a row of the log."""
+        run, progress = self.config.run, self.loop.progress
+        policy = self.policy()
+        trial = self._trial(policy.act, progress.champion)
+        self._save(policy, trial)
+        values = trial.table() | {"champion": progress.champion}
+        if means := self._mean_actions(policy):
+            values["mean_actions"] = means
+        if ending and run.rule == "none" and run.members > 1:
+            members = range(run.members)
+            values["members"] = [self._trial(self.policy(k).act, k).mean for k in members]
+        return values
+
+    def close(self) -> None:
+        """Let go of the env."""
+        if self._env is not None:
+            self._env.close()
+
+    def _save(self, policy: Policy, trial: Evaluation) -> None:
+        progress, episodes = self.loop.progress, self.config.run.eval_episodes
+        score = {"score": trial.mean, "score_std": trial.std, "score_episodes": episodes}
+        policy.about.update(score)
+        policy.save(self.directory.policy_file)
+        if progress.step > 0 and (progress.best is None or trial.mean > progress.best):
+            progress.best = trial.mean
+            policy.about["score_note"] = "the best of many evaluations, so biased upwards"
+            policy.save(self.directory.best_file)
+
+    def _mean_actions(self, champion: Policy) -> dict[str, Any]:
+        """Mean, deviation and returns of each mean action, on the champion's starts."""
+        found: dict[str, Any] = {}
+        for name, policies in self.loop.averaged(champion).items():
+            trial = self._trial(mean_action(policies), self.loop.progress.champion)
+            found[name] = {"mean": trial.mean, "std": trial.std, "returns": trial.returns}
+        return found
+
+    def _trial(self, act: Act, member: int) -> Evaluation:
+        run = self.config.run
+        if self._env is None:
+            self._env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
+        with blame(member, self.loop.progress.step):
+            return rollouts(act, self._env, run.eval_episodes)

@@ -1,0 +1,150 @@
+"""Mean actions: what is averaged, on which starts, and that training never notices."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from numeric import same
+from scripted_runs import IDLE, start
+from short_runs import content, log, run_to_end
+
+from pacesetter import storage
+from pacesetter.ensemble.averages import mean_action
+from pacesetter.ensemble.rules import Choice
+from pacesetter.policy import Policy
+from pacesetter.runs import RunDirectory
+from pacesetter.training.trainer import Trainer
+
+
+def evaluations(directory: RunDirectory) -> list[dict[str, Any]]:
+    return [row for row in log(directory) if row["kind"] == "eval"]
+
+
+def acting(value: float, mean: float = 0.0) -> Policy:
+    """A policy of one layer whose action is tanh(value * (x - mean))."""
+    layer = {"kernel": np.array([[value]], np.float32), "bias": np.zeros(1, np.float32)}
+    statistics = np.full(1, mean, np.float32), np.ones(1, np.float32)
+    box = np.ones(1, np.float32)
+    return Policy([[layer]], "relu", "tanh", -box, box, statistics)
+
+
+def test_mean_action_is_that_of_actions_not_of_weights() -> None:
+    """Each policy by its own statistics: tanh(2 (x - 1)) and tanh(-x), averaged."""
+    act, x = mean_action([acting(2, 1), acting(-1)]), np.array([3.0], np.float32)
+    expected = (np.tanh(4) + np.tanh(-3)) / 2
+    np.testing.assert_allclose(act(x), [expected], rtol=1e-6)
+    assert act(x).dtype == np.float32
+
+
+def test_ensembles_log_both_means_and_one_member_none(runs: Path) -> None:
+    many = evaluations(run_to_end(start(runs, name="many", eval_every=50, eval_episodes=2)))
+    for row in many:
+        assert set(row["mean_actions"]) == {"members", "ema"}
+        for found in row["mean_actions"].values():
+            assert found["mean"] == np.mean(found["returns"])
+            assert found["std"] == np.std(found["returns"])
+            assert len(found["returns"]) == 2
+    one = run_to_end(start(runs, algorithm="td3", name="one"))
+    off = run_to_end(start(runs, name="off", mean_actions="off"))
+    for row in [*evaluations(one), *evaluations(off)]:
+        assert "mean_actions" not in row
+    (alone, *_) = evaluations(
+        run_to_end(start(runs, algorithm="td3", name="on", mean_actions="on"))
+    )
+    assert set(alone["mean_actions"]) == {"ema"}  # that of all members is the champion's
+
+
+@pytest.mark.parametrize("more", [{}, {"normalize_observation": True, "assess": 1}])
+def test_training_never_notices(more: dict[str, Any], runs: Path) -> None:
+    """With and without mean actions: learners, replay, envs, streams and counters end the same."""
+    found: list[Any] = []
+    for name, settings in (
+        ("on", {"mean_actions": "on", "snapshots": 3}),
+        ("off", {"mean_actions": "off"}),
+    ):
+        run = content(run_to_end(start(runs, name=name, eval_every=30, **settings, **more)))
+        del run["table"]["averages"]
+        arrays = {n: x for n, x in run["arrays"].items() if not n.startswith("averages.")}
+        rows = [{n: x for n, x in row.items() if n != "mean_actions"} for row in run["log"]]
+        found.append((arrays, run["table"], rows))
+    (one, *rest), (other, *others) = found
+    assert same(one, other)
+    assert rest == others
+
+
+def test_ema_actor_follows_by_its_tau(runs: Path) -> None:
+    """Told again in NumPy: the first update's actor, then a step of 0.2 towards each later one."""
+    trainer = start(runs, rule="none", ema_tau=0.2, steps=60)
+    averages, told = trainer.loop.averages, dict[int, Any]()
+    follow = averages.follow
+
+    def watched(k: int) -> None:
+        actor = jax.device_get(trainer.loop.learners.states[k].actor)
+        tau = 0.2 if k in told else 1.0
+        told[k] = jax.tree.map(lambda x, y: (1 - tau) * x + tau * y, told.get(k, actor), actor)
+        follow(k)
+
+    averages.follow = watched
+    run_to_end(trainer)
+    for k, expected in told.items():
+        found = jax.tree.map(lambda x: x[0], averages.ema[k])
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6),
+            *map(list, (found, expected)),
+        )
+    assert set(told) == {0, 1}
+
+
+def test_copies_take_over_the_ema_actor(runs: Path) -> None:
+    """By parents as it is; by weights the mean, in its floating-point leaves."""
+    trainer = start(runs, steps=60, rule="none")
+    run_to_end(trainer)
+    averages = trainer.loop.averages
+    first, second = jax.device_get(averages.ema)
+    averages.copy(Choice(np.array([1, 1])))
+    assert same(jax.device_get(averages.ema), [second, second])
+    averages.ema = [first, second]
+    averages.copy(Choice(np.array([0, 0]), np.full((2, 2), 0.5)))
+    mean = jax.tree.map(lambda x, y: x * np.float32(0.5) + y * np.float32(0.5), first, second)
+    assert same(jax.device_get(averages.ema), [mean, mean])
+
+
+def test_before_any_update_means_are_those_of_fresh_actors(runs: Path) -> None:
+    """At step 0 the EMA actors are the members, so both means are one."""
+    (row, *_) = evaluations(run_to_end(start(runs, **IDLE)))
+    members, ema = row["mean_actions"]["members"], row["mean_actions"]["ema"]
+    assert row["step"] == 0
+    assert members == ema
+
+
+def test_snapshots_are_the_last_champions(runs: Path) -> None:
+    trainer = start(runs, steps=120, eval_every=30, snapshots=2)
+    seen: list[Policy] = []
+    averaged = trainer.loop.averaged
+
+    def watched(champion: Policy) -> Any:
+        seen.append(champion)
+        found = averaged(champion)
+        kept = found["snapshots"]
+        assert len(kept) == min(len(seen), 2)
+        for mine, champion in zip(kept, seen[-2:], strict=False):
+            assert same(mine.actors, champion.actors)
+        return found
+
+    trainer.loop.averaged = watched
+    run_to_end(trainer)
+    assert len(seen) == 5
+
+
+def test_checkpoint_from_before_there_were_any_goes_on_and_says_so(runs: Path) -> None:
+    directory = run_to_end(start(runs, steps=60, name="older"))
+    arrays, table = storage.read(directory.state_file, "checkpoint")
+    del table["averages"]
+    arrays = {name: x for name, x in arrays.items() if not name.startswith("averages.")}
+    storage.write(directory.state_file, "checkpoint", storage.Content(arrays, table))
+    trainer = Trainer.resume(directory.path, steps=120)
+    assert trainer.notes == ["averages: the checkpoint has none yet; they begin now"]
+    run_to_end(trainer)
+    assert all(ema is not None for ema in trainer.loop.averages.ema)
