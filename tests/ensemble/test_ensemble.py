@@ -725,7 +725,7 @@ def test_training_selection_and_evaluation_never_share_a_start(
     assert not set(train) & set(evaluate)
     assert not set(select) & set(evaluate)
     assert evaluations >= 2
-    assert evaluate == evaluate[:3] * evaluations
+    assert evaluate == evaluate[:3] * (3 * evaluations)  # the champion and two mean actions
     assert len(set(evaluate)) == 3
     assert trials >= 2
     rounds = np.reshape(select[: trials * 4], (trials, 2, 2))
