@@ -1,4 +1,4 @@
-"""NPROC is read once, and signals end the process with their codes from its first moments on."""
+"""What a process takes from its environment, and how signals end it from its first moments on."""
 
 import os
 import signal
@@ -10,7 +10,15 @@ import pytest
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
-from pacesetter.process import CODES, cores, exit_code, fix_threads, stopping, threads
+from pacesetter.process import (
+    CODES,
+    cores,
+    exit_code,
+    fix_threads,
+    forget_jax_settings,
+    stopping,
+    threads,
+)
 from pacesetter.runs.provenance import provenance
 
 
@@ -37,7 +45,7 @@ def test_what_is_used_is_what_is_recorded(
     monkeypatch.setenv("NPROC", text)
     expected = count or len(cores())
     assert threads() == expected
-    assert provenance(None)["threads"] == expected
+    assert provenance()["threads"] == expected
     fix_threads()  # which XLA reads for itself
     assert os.environ["NPROC"] == str(expected)
 
@@ -118,3 +126,34 @@ def test_the_first_signal_asks_for_the_end(number: int) -> None:
         assert asked == received == [number]
         assert exit_code(received) == CODES[number]
     assert signal.getsignal(number) == before
+
+
+# The environment.
+
+
+def test_settings_of_jax_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but those that say where it runs."""
+    for name in [name for name in os.environ if name.startswith(("JAX_", "XLA_"))]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("JAX_ENABLE_X64", "banana")
+    monkeypatch.setenv("JAX_RANDOM_SEED_OFFSET", "3")
+    monkeypatch.setenv("XLA_FLAGS", "--nonsense")
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    assert forget_jax_settings() == ["JAX_ENABLE_X64", "JAX_RANDOM_SEED_OFFSET", "XLA_FLAGS"]
+    left = {name for name in os.environ if name.startswith(("JAX_", "XLA_"))}
+    assert left == {"JAX_PLATFORMS"}
+
+
+def test_a_bad_environment_is_a_line_each(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "pacesetter", "train", "td3", "Pendulum-v1", "-q"]
+    bad = {"JAX_ENABLE_X64": "banana", "JAX_PLATFORMS": "abacus"}
+    done = subprocess.run(
+        words, env=os.environ | bad, cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    ignored, refused = done.stderr.splitlines()
+    assert ignored.startswith("pacesetter: ignored JAX_ENABLE_X64")
+    assert refused == (
+        "pacesetter: JAX_PLATFORMS: this machine has no 'abacus'; unset it, or set it to cpu"
+    )
+    assert not (tmp_path / "runs").exists()

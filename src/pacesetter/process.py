@@ -1,4 +1,4 @@
-"""A command's process: its cores and threads, and how signals end it."""
+"""A command's process: its cores, threads and environment, and how signals end it."""
 
 import os
 import signal
@@ -15,6 +15,14 @@ CODES: dict[int, int] = {
     signal.SIGTERM: 143,
     signal.SIGHUP: 129,
     signal.SIGUSR1: 143,
+}
+# Where JAX runs and what it keeps. All else that it reads from the environment may change the
+# numbers of a seed, or end the command with a traceback.
+KEPT = {
+    "JAX_PLATFORMS",
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_CUDA_VISIBLE_DEVICES",
+    "JAX_ROCM_VISIBLE_DEVICES",
 }
 Handler = Callable[[int, FrameType | None], None]
 
@@ -47,6 +55,18 @@ def threads() -> int:
 def fix_threads(count: int | None = None) -> None:
     """Fix the number of threads before JAX is imported, so that XLA takes it too."""
     os.environ["NPROC"] = str(count or threads())
+
+
+def forget_jax_settings() -> list[str]:
+    """Take out of the environment what changes the numbers of a seed; the names of what was set.
+
+    To be called before JAX is imported, which reads them then.
+    """
+    names = [name for name in os.environ if name.startswith("JAX_") and name not in KEPT]
+    names += [name for name in ("XLA_FLAGS",) if name in os.environ]
+    for name in names:
+        del os.environ[name]
+    return sorted(names)
 
 
 def leave(number: int, frame: FrameType | None) -> None:

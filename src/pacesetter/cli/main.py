@@ -14,7 +14,7 @@ from pacesetter.cli.show import show
 from pacesetter.cli.train import resume, train
 from pacesetter.cli.tune import tune
 from pacesetter.errors import TrainingError, UsageError, unknown
-from pacesetter.process import Interrupted, exit_code
+from pacesetter.process import Interrupted, exit_code, forget_jax_settings
 
 VERBS: dict[str, Callable[[list[str]], int]] = {
     "train": train,
@@ -70,6 +70,9 @@ def _run(words: list[str]) -> int:
         return 0
     if words[0] not in VERBS:
         raise unknown("verb", words[0], VERBS, see="pacesetter --help")
+    if ignored := forget_jax_settings():
+        why = "the numbers of a seed may depend on what JAX is told there"
+        print(f"pacesetter: ignored {', '.join(ignored)}: {why}", file=sys.stderr)
     return VERBS[words[0]](words[1:])
 
 

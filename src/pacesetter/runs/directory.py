@@ -93,9 +93,7 @@ class RunDirectory:
                     f"run: {file.parent} has {found}; give runs with other settings another --name"
                 )
 
-    def create(
-        self, config: Config, backend: str | None = None, products: str | None = None
-    ) -> None:
+    def create(self, config: Config, **found: Any) -> None:
         """Make the folder and write its config, which starts the run on disk."""
         try:
             places = (self.path, *self.path.parents)
@@ -103,19 +101,15 @@ class RunDirectory:
             self.state_file.parent.mkdir(parents=True, exist_ok=True)
             self.lock()
             self.refuse_existing(config)  # another process may have been quicker
-            table = {
-                "schema": SCHEMA,
-                "settings": config.settings(),
-                **provenance(backend, products),
-            }
+            table = {"schema": SCHEMA, "settings": config.settings(), **provenance(**found)}
             self._write_config(table)
         except OSError as error:
             raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
 
-    def note_resume(self, config: Config, step: int, backend: str, products: str) -> None:
+    def note_resume(self, config: Config, step: int, **found: Any) -> None:
         """Note in the config when and with what the run was resumed, and its settings now."""
         table = self.record()
-        resumed = [*table.get("resumed", []), {"step": step, **provenance(backend, products)}]
+        resumed = [*table.get("resumed", []), {"step": step, **provenance(**found)}]
         self._write_config(table | {"settings": config.settings(), "resumed": resumed})
 
     def remove(self) -> None:

@@ -15,16 +15,15 @@ from pacesetter.process import cores, threads
 PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 
 
-def provenance(backend: str | None, products: str | None = None) -> dict[str, Any]:
-    """Where this process runs and with what: JAX's backend, and who makes matrix products."""
+def provenance(**found: Any) -> dict[str, Any]:
+    """Where this process runs and with what; `found` is what the learner's side knows of that."""
     return {
         "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
         "machine": f"{platform.machine()}, {len(cores())} cores",
-        "backend": backend,
-        "products": products,
+        **found,
     }
 
 

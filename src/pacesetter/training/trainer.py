@@ -4,8 +4,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
 
-import jax
-
 from pacesetter.config import resolve
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
@@ -13,7 +11,7 @@ from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.learner import products
-from pacesetter.learner.backend import prepare
+from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
 from pacesetter.seeding import Stream
@@ -46,10 +44,9 @@ class Trainer:
         self.config = resolve(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
-        prepare(self.config.run.device)
+        self.notes = prepare(self.config.run.device)
         self._begin()
-        made_by = products.of(self.config.hyper)
-        self.directory.create(self.config, jax.default_backend(), made_by)
+        self.directory.create(self.config, **made_with(products.of(self.config.hyper)))
         try:
             self.loop.open_replays(self.directory.state_file.parent)
             checkpoint.save(self.loop, self.config, self.directory)
@@ -80,18 +77,18 @@ class Trainer:
         if changed:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
-        prepare(self.config.run.device)
+        self.notes = prepare(self.config.run.device)
         self._begin()
         self.directory.lock()
         try:
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
-            self.notes = checkpoint.restore(self.loop, self.config, self.directory)
+            self.notes += checkpoint.restore(self.loop, self.config, self.directory)
             if self.progress.step > self.budget:
                 made = f"{self.progress.step:,}"
                 raise UsageError(f"steps: the run has made {made} already; give more")
-            backend, made_by = jax.default_backend(), products.of(self.config.hyper)
-            self.directory.note_resume(self.config, self.progress.step, backend, made_by)
+            found = made_with(products.of(self.config.hyper))
+            self.directory.note_resume(self.config, self.progress.step, **found)
         except BaseException:
             self.directory.unlock()
             raise

@@ -1,0 +1,50 @@
+"""What numbers depend on is the same in every process, and on record."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+from short_runs import TINY, assert_same, run_to_end
+
+from pacesetter.learner.backend import NUMERICS
+from pacesetter.training.trainer import Trainer
+
+PROBE = "broken_envs:Probe-v0"
+OTHER: dict[str, Any] = {
+    "jax_enable_x64": True,
+    "jax_default_prng_impl": "rbg",
+    "jax_threefry_partitionable": False,
+    "jax_random_seed_offset": 7,
+    "jax_default_matmul_precision": "bfloat16",
+}
+
+
+def test_defaults_are_those_of_jax() -> None:
+    """So that holding them fast changed no run, and a JAX with others is noticed."""
+    assert {name: jax.config.values[name] for name in NUMERICS} == NUMERICS
+
+
+def test_settings_of_this_process_change_no_run(tmp_path: Path) -> None:
+    """They are set back, with a note each; the record says what was in force."""
+    plain = run_to_end(Trainer("td3", PROBE, runs=tmp_path / "plain", **TINY, steps=150))
+    try:
+        for name, value in OTHER.items():
+            jax.config.update(name, value)
+        trainer = Trainer("td3", PROBE, runs=tmp_path / "other", **TINY, steps=150)
+    finally:
+        for name, value in NUMERICS.items():
+            jax.config.update(name, value)
+    assert [note.split()[0] for note in trainer.notes] == [*NUMERICS]
+    assert_same(plain, run_to_end(trainer))
+    for run in (plain, trainer.directory):
+        assert run.record()["numerics"] == NUMERICS
+
+
+def test_libraries_that_are_told_otherwise_are_on_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "0")
+    trainer = Trainer("td3", PROBE, runs=tmp_path, **TINY, steps=150)
+    trainer.close()
+    assert trainer.directory.record()["numerics"] == NUMERICS | {"NVIDIA_TF32_OVERRIDE": "0"}
