@@ -101,7 +101,7 @@ class Trainer:
             Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
             for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
         ]
-        self.notes = envs[0].check()
+        self.notes += envs[0].check()
         self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
         self._evaluator = Evaluator(self.loop, self.config, self.directory)
         self._reports: list[Report] = []
