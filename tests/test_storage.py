@@ -1,6 +1,8 @@
 """What is written is read back, byte for byte, and a failed write leaves what was there."""
 
+import errno
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -116,3 +118,92 @@ def test_failure_at_any_step_leaves_a_whole_file(
     storage.write(file, "thing", Content({"a": BASE}, {"n": 3}), keep)
     assert storage.read(file, "thing").table == {"n": 3}
     assert storage.read(keep, "thing").table == {"n": 1}
+
+
+@pytest.mark.parametrize("answer", [errno.EPERM, errno.ENOTSUP, errno.ENOSYS])
+def test_without_second_names_two_writes_are_kept_too(
+    answer: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on exFAT and some network file systems."""
+
+    def no_links(*arguments: Any, **options: Any) -> None:
+        raise OSError(answer, os.strerror(answer))
+
+    monkeypatch.setattr(os, "link", no_links)
+    file, keep = tmp_path / "file", tmp_path / "before"
+    for n in range(3):
+        storage.write(file, "thing", Content({}, {"n": n}), keep)
+    assert storage.read(file, "thing").table == {"n": 2}
+    assert storage.read(keep, "thing").table == {"n": 1}
+    storage.link(keep, file)
+    assert storage.read(file, "thing").table == {"n": 1}
+
+
+@pytest.mark.parametrize(("answer", "whole"), [(errno.EINVAL, True), (errno.EIO, False)])
+def test_a_folder_that_cannot_be_synced(
+    answer: int, whole: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """EINVAL is what some network file systems answer; any other answer is a fault of the disk."""
+    sync = os.fsync
+
+    def of_files_only(file: int) -> None:
+        if Path(f"/dev/fd/{file}").resolve().is_dir():
+            raise OSError(answer, os.strerror(answer))
+        sync(file)
+
+    monkeypatch.setattr(os, "fsync", of_files_only)
+    if whole:
+        storage.write_atomically(tmp_path / "file", b"1")
+    else:
+        with pytest.raises(OSError, match=os.strerror(answer)):
+            storage.write_atomically(tmp_path / "file", b"1")
+    assert (tmp_path / "file").read_bytes() == b"1"
+
+
+def link_to_a_file(path: Path) -> None:
+    other = path.with_name("other")
+    other.write_bytes(b"another's")
+    path.symlink_to(other)
+
+
+ODD: dict[str, Callable[[Path], object]] = {
+    "link": link_to_a_file,
+    "link to nowhere": lambda path: path.symlink_to("nowhere"),
+    "pipe": os.mkfifo,
+    "folder": Path.mkdir,
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+@pytest.mark.parametrize("mode", ["rb", "ab", "r+b", "w"])
+def test_what_is_no_file_is_not_opened(kind: str, mode: str, tmp_path: Path) -> None:
+    """Nor followed, nor waited for."""
+    ODD[kind](tmp_path / "file")
+    with pytest.raises(OSError, match="is not a regular file"):
+        open(tmp_path / "file", mode, opener=storage.regular)  # noqa: SIM115
+    with pytest.raises(UsageError, match="file: cannot be read: is not a regular file"):
+        storage.read(tmp_path / "file", "thing")
+    if kind == "link":
+        assert (tmp_path / "other").read_bytes() == b"another's"
+
+
+def test_a_link_is_replaced_not_written_through(tmp_path: Path) -> None:
+    """Also where the temporary file would lie."""
+    link_to_a_file(tmp_path / "file")
+    (tmp_path / f"file{storage.TEMPORARY}").symlink_to("other")
+    storage.write_atomically(tmp_path / "file", b"own", tmp_path / "before")
+    assert storage.read_bytes(tmp_path / "file") == b"own"
+    assert (tmp_path / "other").read_bytes() == b"another's"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other"]
+
+
+def test_a_write_that_fails_leaves_no_litter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        storage.write_atomically(tmp_path / "file", b"1")
+    assert not [*tmp_path.iterdir()]

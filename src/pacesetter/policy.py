@@ -168,7 +168,8 @@ def unstack(stacked: Any) -> list[Layers]:
 def load(path: str | Path) -> Policy:
     """The policy of a policy file; nothing in the file is executed or imported."""
     path = Path(path)
-    arrays, table = storage.read(path, KIND)
+    # A person, or the hub's cache, may name a link.
+    arrays, table = storage.read(path.resolve() if path.is_symlink() else path, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
             f"{path}: policy schema {table.get('schema')}; this version reads {SCHEMA}"

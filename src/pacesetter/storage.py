@@ -1,8 +1,13 @@
-"""Safe files: arrays and JSON in safetensors, hashed, replaced atomically, read without trust."""
+"""Safe files: arrays and JSON in safetensors, hashed, replaced atomically, read without trust.
 
+Every file of a run's folder is opened, read and replaced by the functions here.
+"""
+
+import errno
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Mapping
 from math import isfinite
 from pathlib import Path
@@ -17,7 +22,10 @@ from pacesetter.errors import UsageError
 from pacesetter.types import Arrays
 
 TEMPORARY = ".pacesetter-tmp"
-
+NOT_REGULAR = "is not a regular file"
+# What opening answers for a link, a pipe that nobody reads, and a folder.
+_ODD = {errno.ELOOP, errno.EMLINK, errno.ENXIO, errno.EISDIR}
+_NO_LINKS = {errno.EPERM, errno.EACCES, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK}
 
 # What reading a damaged or hostile file may raise besides UsageError.
 FAULTS = (
@@ -60,32 +68,86 @@ def digest(array: NDArray[Any]) -> str:
     return hashlib.sha256(np.ascontiguousarray(array).data).hexdigest()
 
 
+def regular(path: str | Path, flags: int) -> int:
+    """Open a regular file, as `opener` of `open`: follow no link, wait for no pipe.
+
+    Raises OSError for a link, a folder, a pipe or a device.
+    """
+    try:
+        file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    except OSError as error:
+        if error.errno in _ODD:
+            raise OSError(errno.EINVAL, NOT_REGULAR, str(path)) from None
+        raise
+    if not stat.S_ISREG(os.fstat(file).st_mode):
+        os.close(file)
+        raise OSError(errno.EINVAL, NOT_REGULAR, str(path))
+    return file
+
+
+def read_bytes(path: Path) -> bytes:
+    """All bytes of a regular file."""
+    with open(path, "rb", opener=regular) as file:
+        return file.read()
+
+
+def present(path: Path) -> bool:
+    """Whether anything has this name, be it a link that leads nowhere."""
+    return os.path.lexists(path)
+
+
+def is_regular(path: Path) -> bool:
+    """Whether a regular file, no link to one, has this name."""
+    return present(path) and stat.S_ISREG(path.lstat().st_mode)
+
+
 def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
     """Replace a file so that a kill or a power cut leaves the old or the new one, never a part.
 
     `keep` is where the replaced file stays reachable.
     """
     temporary = path.with_name(path.name + TEMPORARY)
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    if keep is not None and path.exists():
-        link(path, keep)
-    temporary.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
+    temporary.unlink(missing_ok=True)
+    try:
+        with open(temporary, "xb", opener=regular) as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        if keep is not None and is_regular(path):
+            link(path, keep)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(path: Path) -> None:
+    folder = os.open(path, os.O_RDONLY)
     try:
         os.fsync(folder)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # the answer of file systems that sync files alone
+            raise
     finally:
         os.close(folder)
 
 
 def link(path: Path, to: Path) -> None:
-    """Give a file a second name, in place of what had that name."""
+    """Give a file a second name, in place of what had that name.
+
+    Where the file system knows no second names, the file gets the new name alone.
+    """
     temporary = to.with_name(to.name + TEMPORARY)
     temporary.unlink(missing_ok=True)
-    os.link(path, temporary)
-    temporary.replace(to)
+    try:
+        os.link(path, temporary)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        path.replace(to)
+    else:
+        temporary.replace(to)
 
 
 def write(path: Path, kind: str, content: Content, keep: Path | None = None) -> None:
@@ -116,7 +178,7 @@ def _ordered(data: bytes) -> bytes:
 def read(path: Path, kind: str) -> Content:
     """Read a file that `write` made, or refuse it in one line: foreign, damaged or missing."""
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
         manifest = _manifest(data)
         if manifest.get("kind") != kind:
             raise UsageError(f"{path}: is not a pacesetter {kind}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pacesetter.cli.progress import Pace, bars
 from pacesetter.runs import Row, RunDirectory
+from pacesetter.storage import regular
 from pacesetter.study.bench.queue import Bench
 from pacesetter.study.bench.suite import Job
 
@@ -110,7 +111,7 @@ def _update_rows(shown: "Progress", rows: dict[str, Any], running: dict[str, Job
 def _last(directory: RunDirectory) -> tuple[int, str]:
     """The step of a log's last whole line, and its last evaluation's return as text."""
     try:
-        with directory.metrics_file.open("rb") as file:
+        with open(directory.metrics_file, "rb", opener=regular) as file:
             file.seek(-min(TAIL, os.fstat(file.fileno()).st_size), os.SEEK_END)
             lines = file.read().split(b"\n")[:-1]
     except OSError:

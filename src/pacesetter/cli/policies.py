@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pacesetter.cli.flags import Parser, split_env_kwargs
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
+from pacesetter.storage import NOT_REGULAR, is_regular, present
 
 if TYPE_CHECKING:
     from pacesetter.policy import Policy
@@ -71,8 +72,10 @@ def policy_file(run: str, runs: str) -> Path:
     if Path(run).suffix == ".safetensors":
         return Path(run)
     found = find(run, runs)
-    if not found.policy_file.exists():
+    if not present(found.policy_file):
         raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")
+    if not is_regular(found.policy_file):
+        raise UsageError(f"run: {found.policy_file} {NOT_REGULAR}")
     return found.policy_file
 
 

@@ -3,10 +3,10 @@
 from pacesetter.runs.directory import (
     FREE_PER_SEED,
     SCHEMA,
-    Row,
     RunDirectory,
 )
 from pacesetter.runs.finding import find, find_all, find_group, find_matching
+from pacesetter.runs.log import Row
 
 __all__ = [
     "FREE_PER_SEED",

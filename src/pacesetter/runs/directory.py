@@ -1,25 +1,32 @@
-"""The run directory: its files, its config, its log and its lock."""
+"""The run directory: its files and its config."""
 
-import fcntl
 import json
-import os
-import platform
 import re
 import shlex
-import shutil
 from collections.abc import Iterable
-from io import TextIOWrapper
+from glob import escape, glob
 from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config, resolve
 from pacesetter.consent import require, words
 from pacesetter.errors import InUseError, UsageError
+from pacesetter.runs.lock import WITHOUT, Lock
+from pacesetter.runs.log import Log, Row
 from pacesetter.runs.provenance import provenance
 from pacesetter.settings.validation import difference
-from pacesetter.storage import TEMPORARY, as_json, write_atomically
+from pacesetter.storage import (
+    NOT_REGULAR,
+    TEMPORARY,
+    as_json,
+    is_regular,
+    present,
+    read_bytes,
+    write_atomically,
+)
 
 SCHEMA = 1
+CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.
 FREE_PER_SEED = {
     "seed",
@@ -30,7 +37,6 @@ FREE_PER_SEED = {
     "checkpoint_every",
     "device",
 }
-Row = dict[str, Any]
 
 
 class RunDirectory:
@@ -38,14 +44,16 @@ class RunDirectory:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.config_file = path / "config.json"
+        self.config_file = path / CONFIG
         self.metrics_file = path / "metrics.jsonl"
         self.policy_file = path / "policy.safetensors"
         self.best_file = path / "best.safetensors"
         self.state_file = path / "last" / "state.safetensors"
         self.previous_file = path / "last" / "previous.safetensors"
-        self._lock: TextIOWrapper | None = None
+        self.log = Log(self.metrics_file)
+        self._lock = Lock(path / "lock")
         self._made: list[Path] = []  # folders that `create` made, the innermost first
+        self._is_new = False  # whether all files of a run that are here are of `create`
 
     @classmethod
     def of(cls, runs: str | Path, config: Config) -> "RunDirectory":
@@ -53,9 +61,22 @@ class RunDirectory:
         run = config.run
         return cls(Path(runs) / re.sub(r"[/:]", "-", run.env) / run.name / str(run.seed))
 
+    @property
+    def files(self) -> list[Path]:
+        """Every file that a run leaves here, but config and lock."""
+        last = self.state_file.parent
+        found = [self.metrics_file, self.policy_file, self.best_file]
+        found += [self.state_file, self.previous_file, *last.glob("replay-*.bin")]
+        return [file for file in found if present(file)]
+
     def refuse_existing(self, config: Config) -> None:
         """Refuse to train where a run is already, and say what to do instead."""
-        if not self.config_file.exists():
+        if not present(self.config_file):
+            if found := self.files:
+                raise UsageError(
+                    f"run: {self.path} has a run's {found[0].name} but no {CONFIG}; put that back, "
+                    "or give this run another --name"
+                )
             self._refuse_other_seeds(config)
             return
         resume = f"go on with `pacesetter {shlex.join(self.resume_words(config))}`"
@@ -71,7 +92,7 @@ class RunDirectory:
 
     def difference_from(self, config: Config) -> str | None:
         """The first setting in which the run here differs; None if none does, or no run is here."""
-        if not self.config_file.exists():
+        if not present(self.config_file):
             return None
         old, new, own = self.settings(), config.settings(), ("algorithm", "env")
         if found := difference(old, new, own):  # a name of the file's own is not even looked up
@@ -81,7 +102,7 @@ class RunDirectory:
     def _refuse_other_seeds(self, config: Config) -> None:
         """Refuse a new seed whose settings differ from those of the other seeds of its name."""
         new = json.loads(json.dumps(config.settings()))
-        for file in sorted(self.path.parent.glob("*/config.json")):
+        for file in sorted(map(Path, glob(f"{escape(str(self.path.parent))}/*/{CONFIG}"))):
             try:
                 old = RunDirectory(file.parent).settings()
             except UsageError:  # damaged, which is for its own commands to say
@@ -96,15 +117,31 @@ class RunDirectory:
     def create(self, config: Config, **found: Any) -> None:
         """Make the folder and write its config, which starts the run on disk."""
         try:
-            places = (self.path, *self.path.parents)
-            self._made = [folder for folder in places if not folder.exists()]
-            self.state_file.parent.mkdir(parents=True, exist_ok=True)
+            self._make_folders()
             self.lock()
             self.refuse_existing(config)  # another process may have been quicker
+            self._is_new = True
             table = {"schema": SCHEMA, "settings": config.settings(), **provenance(**found)}
             self._write_config(table)
-        except OSError as error:
-            raise UsageError(f"runs: cannot write {self.path}: {error.strerror}") from None
+        except BaseException as error:
+            self.remove()
+            if isinstance(error, OSError):
+                reason = f"cannot write {self.path}: {error.strerror}"
+                raise UsageError(f"runs: {reason}") from None
+            raise
+
+    def _make_folders(self) -> None:
+        last = self.state_file.parent
+        for folder in (*reversed(last.parents), last):
+            if folder.is_dir():
+                continue
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                if not folder.is_dir():
+                    raise
+            else:
+                self._made.insert(0, folder)
 
     def note_resume(self, config: Config, step: int, **found: Any) -> None:
         """Note in the config when and with what the run was resumed, and its settings now."""
@@ -113,13 +150,17 @@ class RunDirectory:
         self._write_config(table | {"settings": config.settings(), "resumed": resumed})
 
     def remove(self) -> None:
-        """Undo `create` for a run that cannot start."""
+        """Undo `create` for a run that cannot start: remove what it made and nothing else."""
+        if self._is_new:
+            self.sweep()
+            for file in (*self.files, self.config_file, self._lock.path):
+                file.unlink(missing_ok=True)
         self.unlock()
-        shutil.rmtree(self.path)
-        for folder in self._made[1:]:
-            if any(folder.iterdir()):
+        for folder in self._made:
+            try:
+                folder.rmdir()
+            except OSError:  # somebody else has put something there
                 break
-            folder.rmdir()
 
     def _write_config(self, table: Row) -> None:
         write_atomically(self.config_file, (as_json(table, indent=1) + "\n").encode())
@@ -127,7 +168,7 @@ class RunDirectory:
     def record(self) -> Row:
         """The whole config.json."""
         try:
-            table = json.loads(self.config_file.read_text())
+            table = json.loads(read_bytes(self.config_file))
             if table["schema"] != SCHEMA:
                 raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
             if not isinstance(table.get("threads"), int):
@@ -136,7 +177,9 @@ class RunDirectory:
                 raise ValueError("algorithm and env must be words")
         except FileNotFoundError:
             raise UsageError(f"run: {self.path} holds no run (no config.json)") from None
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except OSError as error:
+            raise UsageError(f"{self.config_file}: cannot be read: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise UsageError(f"{self.config_file}: damaged or foreign: {error}") from None
         return table
 
@@ -155,79 +198,50 @@ class RunDirectory:
             raise UsageError(f"{self.config_file}: damaged: {error} is missing") from None
 
     def rows(self, *kinds: str) -> list[Row]:
-        """All complete rows of the log, or only those of some kinds; others are not parsed."""
-        if not self.metrics_file.exists():
-            return []
-        starts = tuple(f'{{"kind": "{kind}"' for kind in kinds) or ""
-        try:
-            lines = self.metrics_file.read_text().split("\n")[:-1]
-            found = [json.loads(line) for line in lines if line.startswith(starts)]
-            if not all(isinstance(row, dict) for row in found):
-                raise ValueError("a line is not a table")
-        except ValueError as error:
-            raise UsageError(f"{self.metrics_file}: damaged: {error}") from None
-        return found
-
-    def append(self, row: Row) -> None:
-        """Add one line to the log."""
-        with self.metrics_file.open("a") as file:
-            file.write(as_json(row) + "\n")
-
-    def log_size(self) -> int:
-        """Bytes of the log."""
-        return self.metrics_file.stat().st_size if self.metrics_file.exists() else 0
-
-    def sync_log(self) -> int:
-        """Flush the log to disk; returns its size in bytes."""
-        if not self.metrics_file.exists():
-            return 0
-        with self.metrics_file.open("a") as file:
-            os.fsync(file.fileno())
-            return file.tell()
-
-    def cut_log(self, size: int) -> bool:
-        """Truncate the log to what a checkpoint covers; False if rows are missing."""
-        if self.metrics_file.exists():
-            os.truncate(self.metrics_file, min(size, self.log_size()))
-        return self.log_size() == size
+        """All complete rows of the log, or only those of some kinds."""
+        return self.log.rows(*kinds)
 
     def sweep(self) -> None:
         """Remove the temporary files of a killed process."""
         for folder in (self.path, self.state_file.parent):
             for leftover in folder.glob(f"*{TEMPORARY}"):
-                leftover.unlink()
+                try:
+                    leftover.unlink()
+                except OSError as error:
+                    reason = f"cannot remove {leftover}: {error.strerror}"
+                    raise UsageError(f"run: {reason}") from None
+
+    def set_aside(self) -> list[str]:
+        """Rename what is no regular file where the run writes one; a line about each."""
+        notes: list[str] = []
+        for file in (self.policy_file, self.best_file, self.state_file, self.previous_file):
+            if not present(file) or is_regular(file):
+                continue
+            aside = file.with_name(f"{file.name}.aside")
+            if present(aside):
+                raise UsageError(f"run: {file} {NOT_REGULAR}; move it away")
+            file.rename(aside)
+            notes.append(f"{file}: {NOT_REGULAR}; it is {aside.name} now")
+        return notes
 
     def lock(self) -> None:
         """Hold the folder until `unlock` or the process ends; refuse a second holder."""
         try:
-            file = (self.path / "lock").open("a+")
+            self._lock.take()
+        except InUseError as error:
+            raise InUseError(f"run: {error}") from None
         except OSError as error:
-            raise UsageError(f"run: cannot write {self.path}: {error.strerror}") from None
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read(200).strip() or "another process"
-            file.close()
-            raise InUseError(f"run: {self.path} is in use by {holder}") from None
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {platform.node()}\n")
-        file.flush()
-        self._lock = file
+            raise UsageError(f"run: cannot write {self._lock.path}: {error.strerror}") from None
+
+    @property
+    def notes(self) -> list[str]:
+        """What a person should know about how the folder is held."""
+        return [f"{self.path}: {WITHOUT}"] if self._lock.is_weak else []
 
     def unlock(self) -> None:
         """Let another process have the folder."""
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        self._lock.free()
 
     def in_use(self) -> bool:
         """Whether a process holds the folder now."""
-        try:
-            with (self.path / "lock").open() as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except FileNotFoundError:
-            return False
-        except OSError:
-            return True
-        return False
+        return self._lock.is_held()

@@ -1,23 +1,41 @@
 """Runs by the names that people type."""
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 
 from pacesetter.errors import UsageError
-from pacesetter.runs.directory import RunDirectory
+from pacesetter.runs.directory import CONFIG, RunDirectory
+from pacesetter.storage import present
 
 SHOWN = 4  # runs that a refusal names
 
 
 def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
-    """All runs below a folder, in order."""
-    for config in sorted(Path(runs).rglob("config.json")):
-        yield RunDirectory(config.parent)
+    """All runs below a folder, in order; folders that are links are entered too."""
+    for path in sorted(_folders(Path(runs))):
+        yield RunDirectory(path)
+
+
+def _folders(runs: Path) -> Iterator[Path]:
+    """Folders with a config, each once, so that a link in a circle ends."""
+    seen: set[tuple[int, int]] = set()
+    for folder, inner, files in os.walk(runs, followlinks=True):
+        try:
+            found = os.stat(folder)
+        except OSError:  # it was there a moment ago
+            continue
+        if (found.st_dev, found.st_ino) in seen:
+            inner.clear()
+            continue
+        seen.add((found.st_dev, found.st_ino))
+        if CONFIG in files or CONFIG in inner:
+            yield Path(folder)
 
 
 def find(name: str, runs: str | Path = "runs") -> RunDirectory:
     """A run by its path, or by an end of its path or of its name that only one run has."""
-    if (Path(name) / "config.json").exists():
+    if present(Path(name) / CONFIG):
         return RunDirectory(Path(name))
     parts = _plain(name).parts
     found = _called(runs, lambda path: path.parts[-len(parts) :] == parts)

@@ -22,8 +22,8 @@ SCHEMA = 4
 LATER = ("averages",)  # parts that the first checkpoints of this schema have not
 
 
-class _OlderError(UsageError):
-    """A whole checkpoint that an earlier version made."""
+class _Refused(UsageError):  # noqa: N818
+    """What the checkpoint before would not cure."""
 
 
 def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
@@ -40,7 +40,7 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
         "products": products.of(config.hyper),
         "run": _identity(config),
         **{name: part.table() for name, part in loop.parts().items()},
-        "log": directory.sync_log(),
+        "log": directory.log.sync(),
     }
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
 
@@ -49,18 +49,19 @@ def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
     """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
     notes: list[str] = []
     files = [directory.state_file, directory.previous_file]
-    for file in (file for file in files if file.exists()):
+    for file in (file for file in files if storage.present(file)):
         try:
             _restore(loop, config, directory, file, notes)
-        except _OlderError:
+        except _Refused:
             raise
         except UsageError as error:
             notes.append(f"{error}; trying the checkpoint before it")
             continue
+        notes += directory.set_aside()
         if file != directory.state_file:  # the next save must not keep the damaged one instead
             storage.link(file, directory.state_file)
         return notes
-    if not notes and directory.log_size():
+    if not notes and directory.log.read():
         notes = [f"{directory.state_file}: is missing"]
     if notes:
         first = notes[0].removesuffix("; trying the checkpoint before it")
@@ -82,7 +83,7 @@ def _restore(
                 notes.append(f"{name.replace('.', ' ')}: {note}")
     except storage.FAULTS as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
-    if not directory.cut_log(int(table["log"])):
+    if not directory.log.cut(int(table["log"])):
         notes.append(f"{directory.metrics_file}: rows of the log are missing")
     if table["threads"] != threads() and loop.progress.step < loop.budget:
         notes.append(
@@ -100,7 +101,7 @@ def _restore(
 def _refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None:
     schema = table.get("schema")
     if schema == 3:
-        raise _OlderError(
+        raise _Refused(
             f"{file}: checkpoint schema 3 was made by an earlier pacesetter 0.1, this version "
             f"reads {SCHEMA}; resume the run with the commit that its config.json names, or train "
             "it again under another --name"

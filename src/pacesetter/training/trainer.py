@@ -53,7 +53,7 @@ class Trainer:
         except BaseException:
             self.directory.remove()
             raise
-        self.notes += products.notes(self.config.hyper)
+        self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
 
     @classmethod
     def resume(
@@ -83,7 +83,8 @@ class Trainer:
         try:
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
-            self.notes += checkpoint.restore(self.loop, self.config, self.directory)
+            notes = checkpoint.restore(self.loop, self.config, self.directory)
+            self.notes += [*self.directory.notes, *notes]
             if self.progress.step > self.budget:
                 made = f"{self.progress.step:,}"
                 raise UsageError(f"steps: the run has made {made} already; give more")
@@ -209,7 +210,7 @@ class Trainer:
     def _emit(self, kind: str, values: dict[str, Any]) -> None:
         self._clock.tell(self.progress)
         report = Report(kind, self.progress.step, values, self.ledger())
-        self.directory.append(report.row())
+        self.directory.log.append(report.row())
         self._reports.append(report)
 
     def _save_is_due(self) -> bool:

@@ -1,0 +1,144 @@
+"""A lock that ends with its process, be it killed."""
+
+import errno
+import fcntl
+import os
+import platform
+import re
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from pacesetter.errors import InUseError, UsageError
+from pacesetter.storage import regular
+
+# What flock answers where the file system, such as some network ones, has no locks.
+_NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
+WAIT = 0.02  # seconds between two tries to get a lock
+WITHOUT = "its file system has no locks, so only this machine knows that this process has it"
+
+
+class Lock:
+    """A file that one process holds at a time; its text says which one.
+
+    Where the file system has no locks, that text is the lock: it counts as long as a process of
+    that id lives on this machine.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.is_weak = False  # held by its text alone
+        self._file: IO[str] | None = None
+
+    def take(self) -> None:
+        """Hold the file until `free`, or until this process ends.
+
+        Raises InUseError if another holds it and OSError if it cannot be opened.
+        """
+        file = _open(self.path, "a+")
+        try:
+            self.is_weak = not _flock(file, fcntl.LOCK_EX)
+            if self.is_weak:
+                self._refuse_holder(file)
+        except BlockingIOError:
+            holder = _text(file) or "another process"
+            file.close()
+            raise InUseError(f"{self.path.parent} is in use by {holder}") from None
+        except BaseException:
+            file.close()
+            raise
+        if not _is_at(self.path, file):
+            file.close()
+            self.take()
+            return
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}\n")
+        file.flush()
+        self._file = file
+
+    def free(self) -> None:
+        """Let another process have the file."""
+        if self._file is not None:
+            if self.is_weak:
+                self._file.truncate(0)
+            self._file.close()
+            self._file = None
+
+    def is_held(self) -> bool:
+        """Whether a process holds the file now; False if that cannot be told."""
+        try:
+            with _open(self.path, "r") as file:
+                return not _flock(file, fcntl.LOCK_SH) and _lives(_text(file))
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+
+    def _refuse_holder(self, file: IO[str]) -> None:
+        holder = _text(file)
+        if _lives(holder):
+            raise BlockingIOError
+        if holder and not holder.endswith(f" on {platform.node()}"):
+            raise UsageError(
+                f"lock: {self.path} names {holder}, and on a file system without locks nobody can "
+                "tell whether that still runs; if it does not, remove the file"
+            )
+
+
+@contextmanager
+def alone(lock: Lock) -> Generator[None]:
+    """Wait for a lock and hold it in the block."""
+    while True:
+        try:
+            lock.take()
+            break
+        except InUseError:
+            time.sleep(WAIT)
+    try:
+        yield
+    finally:
+        lock.free()
+
+
+def _open(path: Path, mode: str) -> IO[str]:
+    return open(path, mode, encoding="utf-8", errors="replace", opener=regular)
+
+
+def _flock(file: IO[str], kind: int) -> bool:
+    """Lock a file, or raise BlockingIOError; False where the file system has no locks."""
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        return False
+    return True
+
+
+def _is_at(path: Path, file: IO[str]) -> bool:
+    """Whether a file has its name still, which who held it before may have removed."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def _text(file: IO[str]) -> str:
+    file.seek(0)
+    return " ".join(file.read(200).split())
+
+
+def _lives(holder: str) -> bool:
+    """Whether the process that a lock's text names lives on this machine."""
+    found = re.fullmatch(r"process (\d+) on (.*)", holder)
+    if found is None or found[2] != platform.node():
+        return False
+    try:
+        os.kill(int(found[1]), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it lives, and is another user's
+        return True
+    return True
