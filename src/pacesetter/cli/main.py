@@ -8,6 +8,7 @@ from pacesetter.cli.bench import bench
 from pacesetter.cli.compare import compare
 from pacesetter.cli.evaluate import evaluate
 from pacesetter.cli.listing import list_
+from pacesetter.cli.live import live
 from pacesetter.cli.pictures import poster, record, watch
 from pacesetter.cli.share import export, fetch, push
 from pacesetter.cli.show import show
@@ -22,6 +23,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "eval": evaluate,
     "list": list_,
     "show": show,
+    "live": live,
     "compare": compare,
     "bench": bench,
     "tune": tune,

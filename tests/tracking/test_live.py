@@ -1,0 +1,163 @@
+"""`live`: the page shows what the log says, grows with it, and is for this machine alone."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browsers import chromium
+from compare import make_run
+
+from pacesetter.cli.main import main
+from pacesetter.runs import RunDirectory
+from pacesetter.tracking.live import MOST_EPISODES, curve, serving
+
+EVALUATIONS = 4
+
+
+LEDGER = {"updates": 1_900, "wall_seconds": 40.0}
+
+
+@pytest.fixture
+def run(runs: Path) -> RunDirectory:
+    """Four evaluations and a row of training, of a run that has made half its budget."""
+    run = RunDirectory(make_run(runs, budget=2_000, planned=4_000, evaluations=10))
+    run.metrics_file.unlink()
+    for step in range(0, 500 * EVALUATIONS, 500):
+        returns = [step - 10.0, step + 30.0]
+        run.append({"kind": "eval", "step": step, "returns": returns, "mean": step + 10.0} | LEDGER)
+    ended = [[0, 100.0, 10], [0, 300.0, 10]]
+    run.append({"kind": "train", "step": 2_000, "episodes_ended": ended} | LEDGER)
+    return run
+
+
+@pytest.fixture
+def port(run: RunDirectory) -> Iterator[int]:
+    with serving(run) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def get(port: int, path: str, host: str | None = None) -> tuple[int, str]:
+    connection = HTTPConnection("127.0.0.1", port)
+    connection.request("GET", path, headers={"Host": host} if host else {})
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text
+
+
+def test_the_curve_is_that_of_the_log(run: RunDirectory, port: int) -> None:
+    status, text = get(port, "/curve.json")
+    found = json.loads(text)
+    assert status == 200
+    assert found == curve(run)
+    assert found["evaluations"][:2] == [[0, 10.0, -10.0, 30.0], [500, 510.0, 490.0, 530.0]]
+    assert len(found["evaluations"]) == EVALUATIONS
+    assert found["episodes"] == [[2_000, 0, 100.0], [2_000, 0, 300.0]]
+    assert (found["budget"], found["updates"]) == (4_000, 1_900)
+    assert found["title"] == "HalfCheetah-v5, td3, seed 0"
+
+
+def test_a_row_that_is_being_written_is_left_out(run: RunDirectory, port: int) -> None:
+    before = get(port, "/curve.json")
+    line = json.dumps(run.rows()[0] | {"step": 3_000})
+    with run.metrics_file.open("a") as file:
+        file.write(line[:40])
+    assert get(port, "/curve.json") == before
+    with run.metrics_file.open("a") as file:
+        file.write(line[40:] + "\n")
+    assert json.loads(get(port, "/curve.json")[1])["evaluations"][-1][0] == 3_000
+
+
+def test_a_long_run_is_thinned(run: RunDirectory) -> None:
+    """Evenly, so that a browser can draw it."""
+    ended = [[0, float(index), 10] for index in range(2 * MOST_EPISODES)]
+    run.append({"kind": "train", "step": 3_000, "episodes_ended": ended} | LEDGER)
+    found = curve(run)["episodes"]
+    assert MOST_EPISODES / 2 < len(found) <= MOST_EPISODES
+    assert found[-1][2] > 1.9 * MOST_EPISODES
+
+
+def test_an_empty_or_damaged_log_ends_no_server(run: RunDirectory, port: int) -> None:
+    run.metrics_file.write_text("{broken}\n")
+    status, text = get(port, "/curve.json")
+    assert status == 500
+    assert "damaged" in text
+    run.metrics_file.unlink()
+    assert json.loads(get(port, "/curve.json")[1])["evaluations"] == []
+
+
+def test_only_this_machine_and_only_this_page(port: int) -> None:
+    """A page of another site cannot read it through a name that it lets lead here."""
+    assert get(port, "/")[0] == 200
+    assert get(port, "/", f"localhost:{port}")[0] == 200
+    assert get(port, "/curve.json", f"evil.example:{port}")[0] == 403
+    assert get(port, "/../config.json")[0] == 404
+
+
+def test_the_page_asks_no_network(port: int) -> None:
+    text = get(port, "/")[1]
+    assert "http:" not in text
+    assert "https:" not in text
+    assert "src=" not in text
+
+
+def test_bad_input(runs: Path, run: RunDirectory, port: int, capsys: Any) -> None:
+    assert main(["live", "nothing", "--runs", str(runs)]) == 2
+    assert "not found" in capsys.readouterr().err
+    for taken in (port, 99_999):
+        assert main(["live", str(run.path), "--port", str(taken)]) == 2
+        assert f"port: cannot use {taken}" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_its_end(run: RunDirectory) -> None:
+    command = [sys.executable, "-m", "pacesetter", "live", str(run.path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout
+        line = process.stdout.readline().decode()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) == 0
+        assert process.stderr
+        assert process.stderr.read() == b""
+    assert line.startswith("http://127.0.0.1:")
+    assert str(run.path) in line
+
+
+@pytest.mark.slow
+def test_the_page_draws_and_refreshes(run: RunDirectory, port: int, tmp_path: Path) -> None:
+    """In a browser: dark, narrow, without an error, and a new row appears by itself."""
+    with chromium(tmp_path / "profile") as browser:
+        scheme = {"name": "prefers-color-scheme", "value": "dark"}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
+        narrow = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+        browser.get(f"http://127.0.0.1:{port}/")
+        wait_for(browser, "document.querySelectorAll('.point').length", EVALUATIONS)
+        wait_for(browser, "document.querySelectorAll('.episode').length", 2)
+        assert browser.execute_script("return document.documentElement.scrollWidth") == 360
+        paper = "return getComputedStyle(document.body).backgroundColor"
+        assert browser.execute_script(paper) == "rgb(23, 25, 28)"
+        run.append(run.rows("eval")[-1] | {"step": 2_500, "mean": 1234.5})
+        wait_for(browser, "document.querySelectorAll('.point').length", EVALUATIONS + 1)
+        assert browser.find_element("id", "last").text == "1,234.5"
+        assert browser.get_log("browser") == []
+
+
+def wait_for(browser: Any, expression: str, value: int) -> None:
+    end = time.monotonic() + 30
+    while browser.execute_script(f"return {expression}") != value:
+        assert time.monotonic() < end, browser.execute_script(f"return {expression}")
+        time.sleep(0.1)
