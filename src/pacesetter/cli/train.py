@@ -52,7 +52,8 @@ def _new_trainer(words: list[str]) -> Command:
         settings["env_kwargs"] = env_kwargs
     from pacesetter.training.trainer import Trainer
 
-    return Command(Trainer(algorithm, env, runs=runs, config=config, **settings), quiet, log)
+    with aside():
+        return Command(Trainer(algorithm, env, runs=runs, config=config, **settings), quiet, log)
 
 
 def _add_settings(command: Any, algorithm: str, env: str) -> None:
@@ -96,7 +97,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     from pacesetter.training.trainer import Trainer
 
     given = {"steps": found.steps, "time": found.time, "allow": found.allow}
-    return Command(Trainer.resume(directory.path, **given), found.quiet, log)
+    with aside():
+        return Command(Trainer.resume(directory.path, **given), found.quiet, log)
 
 
 def name_of(path: Path) -> str:
@@ -112,7 +114,7 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     final: Any = None
     trainers: list[Trainer] = []
     # From before JAX is imported, which dies of an exception of ours or swallows it.
-    with aside(), stopping(lambda: [each.stop() for each in trainers]) as received:
+    with stopping(lambda: [each.stop() for each in trainers]) as received:
         trainer, quiet, log = begin(words)
         trainers.append(trainer)
         for note in trainer.notes:
@@ -122,6 +124,7 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
         if not quiet and (line := within_warmup(trainer.config)):
             print(f"pacesetter: {line}", file=sys.stderr)
         with (
+            aside(),
             closing(trainer),
             tracked(trainer.directory, log) as write,
             console(trainer, quiet) as show,
