@@ -15,10 +15,12 @@ from typing import Any
 
 from pacesetter.runs import find_all
 from pacesetter.storage import as_json
-from pacesetter.study.compare.comparison import Comparison, compare
+from pacesetter.study.compare.comparison import compare
+from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import compact
 from pacesetter.study.report import contents, contrasts, paper, tables
 from pacesetter.study.report.figures import pdf
+from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
@@ -58,16 +60,17 @@ def shown(study: str, limit: dict[str, str]) -> str:
     """The tables of a study at one place."""
     there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
     found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
-    found += contrasts.best_of_two(there)
+    found += [*contrasts.best_of_two(there), contents.ledger(there.groups)]
     if study == "trust-region" and (beside := paper.published(there)) is not None:
         found.append(beside)
     name, value = next(iter(limit.items()))
-    return tables.markdown(f"{study}: {name} {value}", there.notes, found)
+    return tables.markdown(f"{study}: {name} {value}", headline(there), there.notes, found)
 
 
 def selections(there: Comparison) -> str:
     """What each choice of a parent rested on."""
-    return tables.markdown("Selections", there.notes, contrasts.selections(there))
+    found = contrasts.selections(there)
+    return tables.markdown("Selections", headline(there), there.notes, found)
 
 
 def main() -> None:

@@ -1,5 +1,6 @@
 """Comparing runs: what is found, what is refused, what the tables say, and that all forms agree."""
 
+import csv
 import json
 import math
 import re
@@ -17,7 +18,8 @@ from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import lineage, stats
-from pacesetter.study.compare.comparison import compare, split
+from pacesetter.study.compare.comparison import compare
+from pacesetter.study.compare.groups import split
 from pacesetter.study.compare.results import compact, gather
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
@@ -214,6 +216,33 @@ def test_evaluations_count_at_the_steps_at_which_they_were_due(tmp_path: Path) -
     assert run.cut(8_000).clock[-1] == 8_000
 
 
+@pytest.mark.parametrize("evaluations", [1, 2])
+def test_the_first_short_run_is_compared_and_labelled(evaluations: int, tmp_path: Path) -> None:
+    """A newcomer's run of two evaluations counts by the last, which is said beside it."""
+    for name in ("td3", "sac"):
+        run = make_run(tmp_path, "Ant-v5", name, budget=4_000, evaluations=max(evaluations - 1, 1))
+        if evaluations == 1:
+            last = (run / "metrics.jsonl").read_text().splitlines()[-2:]
+            kept = [line for line in last if '"eval"' in line]
+            (run / "metrics.jsonl").write_text("\n".join(kept) + "\n")
+    found = compare([tmp_path], metric="auc" if evaluations == 1 else "final")
+    assert [len(run.steps) for run in found.runs] == [evaluations] * 2
+    last = [run.returns[-1] for run in found.runs]
+    assert [group.values("final")[0] for group in found.groups] == last
+    (note,) = [line for line in found.notes if "the last one counts alone" in line]
+    assert f"Ant-v5 sac seed 0 ({evaluations})" in note
+    assert "last evaluation alone" in contents.overview(found).rows[0][1].text
+    assert all(np.isfinite(group.values("auc")).all() for group in found.groups)
+
+
+def test_no_chance_to_be_better_from_fewer_than_three_runs_a_side(tmp_path: Path) -> None:
+    for seeds in range(3):
+        for name, level in (("td3", 1_000), ("sac", 2_000)):
+            small(tmp_path, name=name, seed=seeds, level=level)
+        cell = contrasts.against(compare([tmp_path]))[0].rows[0][4]
+        assert cell.text == ("1.00" if seeds == 2 else "-")
+
+
 # Numbers.
 
 
@@ -247,31 +276,29 @@ def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path
     assert run.reached(1_000) == math.inf
 
 
-def test_every_results_table_has_its_ledger_and_versions(runs: Path) -> None:
+def test_every_cell_of_the_paper_has_its_version_and_a_file_has_one_ledger(runs: Path) -> None:
     found = compare([runs])
-    shown = output.everything(found, output.Options(published=True))
+    shown = output.own(found)
     titles = [table.title for table in shown]
     assert titles == [
         "Final return",
+        "Against td3",
         "Each group",
         "Better rewards sooner",
-        "Against td3",
         "All tasks together",
         "Best of two independent runs",
         "Selections",
+        "What a mean run spent",
+    ]
+    assert [table.title for table in paper.tables(found)] == [
         "The paper's table I",
         "The paper's table II",
         "Published returns",
     ]
-    for table in shown:
-        assert table.ledger is not None
-        assert table.ledger.headers[3:] == [
-            "env steps",
-            "updates",
-            "transitions",
-            "CPU s",
-            "wall s",
-        ]
+    spent = ["env steps", "updates", "transitions", "CPU s", "wall s"]
+    assert shown[-1].headers == ["env", "algorithm", "runs", *spent]
+    assert len(shown[-1].rows) == len(found.groups)
+    for table in [*shown, *paper.tables(found)]:
         assert all(len(row) == len(table.headers) for row in table.rows)
     for which in ("I", "II"):
         table = paper.paper_table(found, which)
@@ -308,9 +335,7 @@ def test_results_of_a_file_equal_those_of_the_runs(runs: Path, tmp_path: Path) -
     lines = [compact(RunDirectory(path.parent)) for path in runs.rglob("config.json")]
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     a, b = compare([runs]), compare([file])
-    assert tables.plain(output.everything(a, output.Options())) == tables.plain(
-        output.everything(b, output.Options())
-    )
+    assert tables.plain(output.own(a)) == tables.plain(output.own(b))
     assert a.notes == b.notes
 
 
@@ -397,8 +422,9 @@ def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str,
 def test_without_a_file_a_table_is_printed(runs: Path, command: Any) -> None:
     code, out, err = command(runs, "--metric", "auc")
     assert (code, err) == (0, "")
-    assert out.startswith("Mean return of training\n")
-    assert "Ledger: spent by a mean run" in out
+    assert out.startswith("Against td3, by the 95% interval of the difference in mean return of")
+    assert "\nMean return of training\n" in out
+    assert out.count("What a mean run spent") == 1
     assert "Against td3" in out
 
 
@@ -407,13 +433,56 @@ def test_files_are_written_in_each_form(runs: Path, tmp_path: Path, command: Any
     code, out, _ = command(runs, *words)
     assert (code, out.split()) == (0, ["a.md", "a.tex", "a.pdf"])
     markdown, tex = Path("a.md").read_text(), Path("a.tex").read_text()
-    assert markdown.count("Ledger: spent by a mean run:") == 10
-    assert tex.count("\\begin{table}") == tex.count("\\end{table}") == 11
+    assert markdown.count("What a mean run spent") == 1
+    assert tex.count("\\begin{table}") == tex.count("\\end{table}") == 12
     assert "11719$\\pm$" not in tex
     assert "12,139.5 $\\pm$ 292.7 (v2, n=3, 1M episodes)" in tex
     assert not re.search(r"(?<!\\)%", re.sub(r"^%.*|\{%$", "", tex, flags=re.M))
     pdf = Path("a.pdf").read_bytes()
-    assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") == 6
+    assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") == 7
+
+
+def test_data_and_pictures(runs: Path, command: Any) -> None:
+    """JSON and CSV hold the numbers of the tables; PNG and SVG show every algorithm and task."""
+    found = compare([runs])
+    words = ["-o", "a.json", "-o", "a.csv", "-o", "a.png", "-o", "a.svg"]
+    assert command(runs, *words)[0] == 0
+    told = json.loads(Path("a.json").read_text())
+    with Path("a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert told["result"].startswith("Against td3")
+    for group, one, row in zip(found.groups, told["groups"], rows, strict=True):
+        mean = stats.mean(group.values("final"))
+        assert (one["env"], one["algorithm"]) == (row["env"], row["algorithm"])
+        assert one["metrics"]["final"]["value"] == mean.value == float(row["final"])
+        assert one["metrics"]["final"]["high"] == mean.high == float(row["final_high"])
+        assert one["ledger"]["updates"] == float(row["updates"])
+        assert [run["seed"] for run in one["runs"]] == [0, 1, 2, 3, 4]
+        returns = one["runs"][0]["evaluations"]["return"]
+        assert returns == group.runs[0].returns.tolist()
+        assert (one["difference"] is None) == (group.name == "td3") == (row["difference"] == "")
+    assert Path("a.png").read_bytes().startswith(b"\x89PNG")
+    svg = Path("a.svg").read_text()
+    assert svg.count('<g id="axes_') == 2 * len(found.envs)
+    for word in (*found.envs, *found.names):
+        assert word in svg, word
+
+
+def test_a_notebook_shows_the_result_and_the_table(runs: Path) -> None:
+    found = compare([runs / "Ant-v5"])
+    text = found._repr_html_()
+    assert text.startswith("<p>On Ant-v5, sac has the highest final return of 3 algorithms")
+    assert text.count("<tr") == 1 + len(found.names)
+    assert contents.overview(found).rows[0][1].text in text
+
+
+def test_data_of_one_short_run_has_no_nan(tmp_path: Path, command: Any) -> None:
+    """What is not known is null in JSON and empty in CSV."""
+    run = make_run(tmp_path, budget=4_000, evaluations=1)
+    assert command(run, "-o", "a.json", "-o", "a.csv", "-o", "a.svg")[0] == 0
+    assert "NaN" not in Path("a.json").read_text()
+    assert "nan" not in Path("a.csv").read_text()
+    assert json.loads(Path("a.json").read_text())["groups"][0]["metrics"]["final"]["low"] is None
 
 
 def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from browsers import chromium
 from compare import make_run
@@ -17,8 +18,10 @@ from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.media.record import INSTALL
 from pacesetter.runs import RunDirectory
+from pacesetter.study.compare import stats
+from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.results import compact
-from pacesetter.study.report import html as report
+from pacesetter.study.report import films, intervals
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +70,94 @@ def column(browser: Any, table: int, place: int) -> list[str]:
 
 def test_page_is_one_file_that_asks_nobody(page: Path) -> None:
     text = page.read_text()
-    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", text)
+    linked = re.sub(r'<a href="https://[^"<>]+">', "<a>", text)  # followed by a click alone
+    assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:|#)", linked)
     assert not re.search(r"@import|url\((?!#|data:)|fetch\(|XMLHttpRequest", text)
     assert text.count("<script") == 2
+
+
+def test_page_opens_with_its_result_and_its_contents(page: Path) -> None:
+    """One sentence first; every entry of the contents leads somewhere; the paper comes last."""
+    text = page.read_text()
+    result = re.search(r'<p class="result">(.*?)</p>', text)
+    assert result
+    assert result[1].startswith(
+        "Against td3, by the 95% interval of the difference in final return"
+    )
+    assert text.index(result[0]) < text.index("<nav") < text.index("<table")
+    targets = re.findall(r'<li><a href="#([^"]+)">', text)
+    assert len(targets) == len({*targets}) > 8
+    places = [text.index(f'id="{target}"') for target in targets]
+    assert places == sorted(places)
+    assert targets.index("the-papers-figure-2") > targets.index("what-a-mean-run-spent")
+    assert 'href="https://github.com/sfujim/TD3"' in text
+
+
+def test_a_figure_of_the_paper_without_its_pair_is_left_out(runs: Path, tmp_path: Path) -> None:
+    """Of two tasks of three, and no sunrise: two of six panels, and none is empty."""
+    text = write(tmp_path / "a.html", runs, "--no-film")
+    start = text.index('id="the-papers-figure-2"')
+    assert text[start : text.index("</section>", start)].count('<g id="axes_') == 2
+    assert "no runs" not in text
+    alone = write(tmp_path / "b.html", runs / "Walker2d-v5" / "td3", "--no-film")
+    assert "figure 2" not in alone
+
+
+def test_intervals_stand_where_the_numbers_are(runs: Path) -> None:
+    """Places in percent of the track give back means, intervals and seeds."""
+    found = compare([runs / "Walker2d-v5"])
+    (track,) = intervals.tracks(found)
+    assert [bar.name for bar in track.bars] == ["td3", "multi-td3"]
+    group, bar = found.groups[1], track.bars[0]
+    assert (group.name, group.env) == ("td3", track.env)
+    mean, seeds = stats.mean(group.values("final")), group.values("final")
+    per_percent = (seeds.max() - seeds.min()) / (max(bar.seeds) - min(bar.seeds))
+    base = seeds[0] - per_percent * bar.seeds[0]
+    assert bar.left is not None
+    shown = [base + per_percent * at for at in (bar.dot, bar.left, bar.left + bar.width)]
+    np.testing.assert_allclose(shown, mean, rtol=2e-3)
+    assert min(one.left or 0 for one in track.bars) > 0
+    assert max((one.left or 0) + one.width for one in track.bars) < 100
+
+
+def test_a_narrow_page_keeps_the_first_column_and_shadows_the_rest(opened: Any) -> None:
+    size = {"width": 390, "height": 900, "deviceScaleFactor": 1, "mobile": True}
+    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    opened.refresh()
+    look = """
+        const inner = document.querySelector('#each-group .scroll'), box = inner.parentElement;
+        inner.scrollLeft = arguments[0];
+        await new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)));
+        const cell = inner.querySelector('tbody td').getBoundingClientRect();
+        return [box.classList.contains('more'), Math.round(cell.left), cell.width > 80,
+                getComputedStyle(inner.querySelector('td.number')).textAlign];
+    """
+    script = "return (async (...arguments) => {" + look + "})(...arguments)"
+    first = opened.execute_script(script, 0)
+    last = opened.execute_script(script, 10_000)
+    assert first[0] is True
+    assert last[0] is False
+    assert first[1:] == [first[1], True, "right"] == last[1:]
+
+
+def test_a_dark_scheme_is_dark(opened: Any) -> None:
+    """Text and lines stand out from the ground of either scheme."""
+    brightness = """
+        const sum = (text) => text.match(/\\d+/g).slice(0, 3).reduce((a, b) => a + Number(b), 0);
+        const of = (name, style) => sum(getComputedStyle(document.querySelector(name))[style]);
+        return [of('body', 'backgroundColor'), of('body', 'color'),
+                of('thead th', 'backgroundColor'), of('td:first-child', 'backgroundColor')];
+    """
+    found: dict[str, list[int]] = {}
+    for scheme in ("light", "dark"):
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+        found[scheme] = opened.execute_script(brightness)
+    opened.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    ground, ink, *cells = found["light"]
+    assert min(ground, *cells) > 700 > 150 > ink
+    ground, ink, *cells = found["dark"]
+    assert max(ground, *cells) < 150 < 600 < ink
 
 
 def test_page_opens_without_errors_or_requests(opened: Any) -> None:
@@ -133,7 +221,7 @@ def test_every_control_is_reached_by_tab(opened: Any) -> None:
     from selenium.webdriver.common.keys import Keys
 
     reached: set[str] = set()
-    for _ in range(60):
+    for _ in range(90):
         opened.switch_to.active_element.send_keys(Keys.TAB)
         reached.add(opened.execute_script("return document.activeElement.localName"))
     assert {"a", "button", "input", "svg", "div", "summary"} <= reached
@@ -183,12 +271,12 @@ def test_the_champions_film_is_in_the_page(runs: Path, tmp_path: Path) -> None:
     for run in folder.rglob("config.json"):
         env = run.parent.parent.parent.name
         untrained(env, step=100_000).save(run.parent / "policy.safetensors")
-    films = report.FILM_FRAMES, report.FILM_SIZE
+    whole = films.FILM_FRAMES, films.FILM_SIZE
     try:
-        report.FILM_FRAMES, report.FILM_SIZE = 3, (32, 32)
+        films.FILM_FRAMES, films.FILM_SIZE = 3, (32, 32)
         text = write(tmp_path / "report.html", folder)
     finally:
-        report.FILM_FRAMES, report.FILM_SIZE = films
+        films.FILM_FRAMES, films.FILM_SIZE = whole
     if INSTALL in text:
         pytest.skip("no OpenGL to draw with; the page says so")
     assert text.count("data:video/mp4;base64,AAAA") == 2

@@ -44,7 +44,10 @@ def _parser() -> Parser:
     add("--mixed", action="store_true", help=mixed)
     add("--smooth", type=int, metavar="N", help="smooth curves over N evaluations")
     add("--no-film", action="store_true", help="leave the video out of the report")
-    output = "write a .html report, .md or .tex tables, or .pdf curves; may be repeated"
+    output = (
+        "write a .html report, .md or .tex tables, .csv or .json numbers, or .png, .svg or .pdf "
+        "curves and intervals; may be repeated"
+    )
     add("-o", action="append", default=[], metavar="FILE", help=output)
     command.add_allow()
     command.add_runs()

@@ -1,15 +1,11 @@
-"""Runs grouped for a comparison: which may be compared, and what a reader must be told."""
+"""Gathering runs for a comparison: which may be compared, and what a reader must be told."""
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked
 
@@ -19,19 +15,11 @@ from pacesetter.settings import STRICT
 from pacesetter.settings.validation import build
 from pacesetter.settings.values import Count, Duration
 from pacesetter.study.compare import stats
+from pacesetter.study.compare.groups import CONTROL, METRICS, Comparison, Group, split
 from pacesetter.study.compare.results import Run, gather
-from pacesetter.study.compare.stats import Array
 
-METRICS = {
-    "final": "mean of the evaluations in the last 10% of the budget, and of at least three",
-    "auc": "area under the curve of evaluations, divided by the env steps it spans",
-    "max": "largest evaluation after the first update; inflated, as a maximum of noisy values is",
-}
-CONTROL = "td3"
-ANT = "pacesetter/Ant111"
 # `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
 _FREE = FREE_PER_SEED - {"replay_horizon", "lr_horizon"}
-_SPENT = ("steps", "updates", "transitions", "cpu", "wall")
 
 
 @checked(frozen=True, config=STRICT)
@@ -43,70 +31,6 @@ class Limit:
 
     def __str__(self) -> str:
         return f"{self.budget:,} env steps" if self.budget else f"{self.cpu:,.0f} CPU seconds"
-
-
-@dataclass(frozen=True)
-class Group:
-    """Runs of one algorithm on one task that differ by seed."""
-
-    env: str
-    name: str
-    runs: list[Run]
-
-    def values(self, metric: str) -> Array:
-        return np.array([run.metric(metric) for run in self.runs])
-
-    def reached(self, level: float) -> Array:
-        return np.array([run.reached(level) for run in self.runs])
-
-    @cached_property
-    def spent(self) -> dict[str, float]:
-        """Ledger of a mean run; what only some algorithms count comes after what all do."""
-        table = {key: np.mean([getattr(run, key)[-1] for run in self.runs]) for key in _SPENT}
-        for key in sorted({key for run in self.runs for key in run.extra}):
-            spent = [run.extra[key][-1] if key in run.extra else 0 for run in self.runs]
-            table[key] = np.mean(spent)
-        return {key: float(value) for key, value in table.items()}
-
-    @property
-    def budgets(self) -> list[int]:
-        return sorted({run.budget for run in self.runs})
-
-    def cut(self, budget: int) -> "Group":
-        return Group(self.env, self.name, [run.cut(budget) for run in self.runs])
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The groups, the metric, the control, and what a reader must be told."""
-
-    groups: list[Group]
-    metric: str
-    reference: str
-    notes: list[str]
-
-    @property
-    def envs(self) -> list[str]:
-        return list(dict.fromkeys(group.env for group in self.groups))
-
-    @property
-    def names(self) -> list[str]:
-        """Algorithms, the control first."""
-        names = sorted({group.name for group in self.groups})
-        return sorted(names, key=lambda name: name != self.reference)
-
-    @property
-    def runs(self) -> list[Run]:
-        return [run for group in self.groups for run in group.runs]
-
-    @property
-    def budget(self) -> int | None:
-        """Env steps of every run, None if they are mixed."""
-        budgets = {run.budget for run in self.runs}
-        return budgets.pop() if len(budgets) == 1 else None
-
-    def find(self, env: str, name: str) -> Group | None:
-        return next((g for g in self.groups if (g.env, g.name) == (env, name)), None)
 
 
 def compare(
@@ -139,15 +63,6 @@ def compare(
     return Comparison(groups, metric, reference, notes + _remarks(groups, kept, limit))
 
 
-def split(env: str) -> tuple[str, str]:
-    """A task without its version, and the version; the Ant with 111 observations is an Ant."""
-    if env.startswith(ANT):
-        task, version = split(env.replace(ANT, "Ant", 1))
-        return task, f"{version}, 111"
-    found = re.fullmatch(r"(.*)-(v\d+)(.*)", env)
-    return (found[1] + found[3], found[2]) if found else (env, "-")
-
-
 def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Run], list[str]]:
     """The runs that made their budget, cut at the limit, and a note for those that did not."""
     kept: list[Run] = []
@@ -160,10 +75,10 @@ def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Ru
             run = run.within(limit.cpu)
         elif limit.budget:
             run = run.cut(limit.budget)
-        if len(run.steps) < stats.FEWEST_EVALUATIONS:
-            out.append(f"{run.source} ({len(run.steps)} evaluations, three are needed)")
-        else:
+        if run.steps.size:
             kept.append(run)
+        else:
+            out.append(f"{run.source} (no evaluation up to {limit})")
     if not kept:
         reason = f": {'; '.join(out[:3])}" if out else ""
         raise UsageError(f"run: none is complete{reason}; limit all with --budget, or resume them")
@@ -203,7 +118,9 @@ def _mixtures(runs: list[Run], mixed: bool, limit: Limit) -> list[str]:
     budgets = sorted({run.budget for run in runs})
     if len(budgets) > 1 and not limit.cpu:
         shown = ", ".join(f"{budget:,}" for budget in budgets)
-        faults.append(f"budget: runs of {shown} env steps; --budget limits all to one")
+        faults.append(
+            f"budget: runs of {shown} env steps; --budget {budgets[0]} takes each up to it"
+        )
     faults += _differing(runs)
     if faults and not mixed:
         raise UsageError(f"{'; '.join(faults)}; --mixed compares them anyway and says so")
@@ -230,6 +147,13 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     if few:
         names = _few([f"{group.env} {group.name} (n={len(group.runs)})" for group in few])
         notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {names}.")
+    short = [run for run in runs if len(run.steps) < stats.FEWEST_EVALUATIONS]
+    if short:
+        names = _few([f"{run.env} {run.name} seed {run.seed} ({len(run.steps)})" for run in short])
+        notes.append(
+            f"Fewer than {stats.FEWEST_EVALUATIONS} evaluations, so the last one counts alone: "
+            f"{names}. A smaller --eval-every gives more."
+        )
     if limit.budget or limit.cpu:
         notes.append(f"Every run counts up to {limit}.")
     if any(run.settings.get("count_selection_steps") is False for run in runs):

@@ -19,7 +19,8 @@ scipy: Any = scipy_stats
 CONFIDENCE = 0.95
 FEWEST_SEEDS = 5  # below, a result is called indicative
 BOOTSTRAP_SEEDS = 10  # below, a nominal 95% covers less: BCa .88 at 5 seeds, .907 at 10
-FEWEST_EVALUATIONS = 3
+FEWEST_EVALUATIONS = 3  # behind a final return; a run of fewer is told apart
+FEWEST_CHANCES = 3  # runs a side behind a probability: of one a side it is 0 or 1
 RESAMPLES = 10_000
 PROFILE_RESAMPLES = 2_000
 POWER = 0.8
@@ -39,13 +40,20 @@ class Interval(NamedTuple):
 
 
 def final(steps: Array, returns: Array, budget: float) -> float:
-    """Mean of the evaluations in the last 10% of the budget, and of at least three."""
+    """Mean of the evaluations in the last 10% of the budget, and of at least three.
+
+    Of one or two it is the last: the mean would take in the policy before it has learned.
+    """
+    if len(returns) < FEWEST_EVALUATIONS:
+        return float(returns[-1])
     count = max(FEWEST_EVALUATIONS, int((steps > 0.9 * budget).sum()))
     return float(returns[-count:].mean())
 
 
 def area(steps: Array, returns: Array) -> float:
     """Area under the curve by trapezoids over the steps it spans: the mean return of training."""
+    if len(returns) == 1:
+        return float(returns[0])
     return float(np.trapezoid(returns, steps) / (steps[-1] - steps[0]))
 
 
@@ -146,9 +154,13 @@ def _iqm(*tasks: Array, axis: int = -1) -> Any:
 def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
     """Probability that a run of x beats one of y on a task, ties counting half, mean over tasks.
 
-    With one task this is the Mann-Whitney U statistic over n m. The interval is a percentile
-    bootstrap from ten seeds on; where every pair has the same outcome, resampling says nothing.
+    With one task this is the Mann-Whitney U statistic over n m. NaN from fewer than three runs a
+    side. The interval is a percentile bootstrap from ten seeds on; where every pair has the same
+    outcome, resampling says nothing.
     """
+    sides = [side for pair in pairs for side in pair]
+    if min(map(len, sides)) < FEWEST_CHANCES or not np.isfinite(np.concatenate(sides)).all():
+        return Interval(np.nan)
     rng = np.random.default_rng(0)
     value, draws, alike = 0.0, np.zeros(RESAMPLES), True
     for x, y in pairs:
@@ -158,7 +170,7 @@ def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
         alike = alike and np.ptp(wins) == 0
         drawn = (_weights(rng, len(x), RESAMPLES) @ wins) * _weights(rng, len(y), RESAMPLES)
         draws += drawn.sum(axis=1) / len(pairs)
-    few = min(len(side) for pair in pairs for side in pair) < BOOTSTRAP_SEEDS
+    few = min(map(len, sides)) < BOOTSTRAP_SEEDS
     return Interval(value) if few or alike else Interval(value, *_percentiles(draws))
 
 

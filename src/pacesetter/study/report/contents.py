@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pacesetter.study.compare import stats
-from pacesetter.study.compare.comparison import METRICS, Comparison, Group, split
-from pacesetter.study.compare.stats import FEWEST_SEEDS, Array, Interval
+from pacesetter.study.compare.groups import METRICS, Comparison, Group, split
+from pacesetter.study.compare.stats import FEWEST_EVALUATIONS, FEWEST_SEEDS, Array, Interval
 from pacesetter.study.report.tables import Cell, Table, interval, number, spread, steps, word
 
 LEVELS = (1_000, 2_000)
@@ -17,6 +17,7 @@ SPENT = {
     "cpu": "CPU s",
     "wall": "wall s",
 }
+NAMES = {"final": "Final return", "auc": "Mean return of training", "max": "Maximum return"}
 INTERVAL = "[low; high] is the 95% interval of the mean by Student's t over seeds."
 
 
@@ -27,16 +28,16 @@ def title(comparison: Comparison) -> str:
     return f"{' and '.join(names) if len(names) <= 3 else f'{len(names)} algorithms'} on {tasks}"
 
 
-def ledger(groups: Sequence[Group], factor: int = 1) -> Table:
-    """What a mean run of each group has spent, times a factor."""
+def ledger(groups: Sequence[Group]) -> Table:
+    """What a mean run of each group has spent."""
     extra = list(dict.fromkeys(key for group in groups for key in group.spent if key not in SPENT))
     rows = [
         [word(group.env), word(group.name), number(len(group.runs))]
-        + [number(factor * group.spent.get(key, 0)) for key in (*SPENT, *extra)]
+        + [number(group.spent.get(key, 0)) for key in (*SPENT, *extra)]
         for group in groups
     ]
     shown = [*SPENT.values(), *(key.replace("_", " ") for key in extra)]
-    return Table("Ledger: spent by a mean run", ["env", "algorithm", "runs", *shown], rows)
+    return Table("What a mean run spent", ["env", "algorithm", "runs", *shown], rows)
 
 
 def overview(comparison: Comparison) -> Table:
@@ -50,18 +51,16 @@ def overview(comparison: Comparison) -> Table:
             found = stats.mean(group.values(metric)) if group else Interval(np.nan)
             row.append(interval(found, after=f" ({about(group)})" if group else ""))
         rows.append(row)
-    title = {"final": "Final return", "auc": "Mean return of training", "max": "Maximum return"}
-    notes = [f"{title[metric]}: {METRICS[metric]}. {INTERVAL}"]
-    return Table(
-        title[metric], ["algorithm", *comparison.envs], rows, notes, ledger(comparison.groups)
-    )
+    notes = [f"{NAMES[metric]}: {METRICS[metric]}. {INTERVAL}"]
+    return Table(NAMES[metric], ["algorithm", *comparison.envs], rows, notes)
 
 
 def about(group: Group) -> str:
     """The small print of a cell: env version, seeds, budget, and whether it is indicative."""
     budget = " and ".join(steps(count) for count in group.budgets)
     few = ", indicative" if len(group.runs) < FEWEST_SEEDS else ""
-    return f"{split(group.env)[1]}, n={len(group.runs)}, {budget}{few}"
+    short = ", last evaluation alone" if group.evaluations < FEWEST_EVALUATIONS else ""
+    return f"{split(group.env)[1]}, n={len(group.runs)}, {budget}{few}{short}"
 
 
 def details(comparison: Comparison) -> Table:
@@ -88,13 +87,7 @@ def details(comparison: Comparison) -> Table:
         "IQM: interquartile mean of final, with a BCa bootstrap interval from ten seeds on.",
     ]
     rows = sorted(rows, key=lambda row: (row[0].text, -(row[3].key or 0)))
-    return Table(
-        "Each group",
-        [*headers, "final of each seed"],
-        rows,
-        notes,
-        ledger(comparison.groups),
-    )
+    return Table("Each group", [*headers, "final of each seed"], rows, notes)
 
 
 def speed(comparison: Comparison) -> Table:
@@ -113,7 +106,7 @@ def speed(comparison: Comparison) -> Table:
         "whole run by the clock on the wall, with its warm-up and evaluations."
     ]
     headers = ["env", "algorithm", "n", *levels, "CPU s per 1k steps", "env steps/s"]
-    return Table("Better rewards sooner", headers, rows, notes, ledger(comparison.groups))
+    return Table("Better rewards sooner", headers, rows, notes)
 
 
 def soon(reached: Array) -> Cell:

@@ -3,9 +3,8 @@
 import numpy as np
 
 from pacesetter.study.compare import lineage, stats
-from pacesetter.study.compare.comparison import Comparison, Group, split
+from pacesetter.study.compare.groups import Comparison, split
 from pacesetter.study.compare.stats import Array, Interval
-from pacesetter.study.report.contents import ledger
 from pacesetter.study.report.published import scale
 from pacesetter.study.report.tables import Cell, Table, count, interval, number, word
 
@@ -14,12 +13,11 @@ EFFECTS = (0.1, 0.2, 0.3)
 
 def against(comparison: Comparison) -> list[Table]:
     """Each algorithm less the control on the same task: gap, chance to be better, seeds needed."""
-    metric, rows, used = comparison.metric, list[list[Cell]](), list[Group]()
+    metric, rows = comparison.metric, list[list[Cell]]()
     for group in comparison.groups:
         control = comparison.find(group.env, comparison.reference)
         if control is None or control is group:
             continue
-        used += [one for one in (control, group) if one not in used]
         x, y = group.values(metric), control.values(metric)
         gap, deviations = stats.difference(x, y), (stats.deviation(x), stats.deviation(y))
         percent = 100 * gap.value / abs(y.mean()) if y.mean() else np.nan
@@ -33,11 +31,12 @@ def against(comparison: Comparison) -> list[Table]:
     headers += [f"for {effect:.0%}" for effect in EFFECTS]
     notes = [
         f"Difference of the mean {metric} return with Welch's 95% t interval; P(better): chance "
-        f"that a run of the algorithm beats one of {comparison.reference}.",
+        f"that a run of the algorithm beats one of {comparison.reference}, given from "
+        f"{stats.FEWEST_CHANCES} runs a side on.",
         "Seeds: for each side, to see that gap with 80% power in a two-sided t test at 5%, if the "
         "standard deviations of these runs are right.",
     ]
-    return [Table(f"Against {comparison.reference}", headers, rows, notes, ledger(used))]
+    return [Table(f"Against {comparison.reference}", headers, rows, notes)]
 
 
 def needed(seeds: float) -> Cell:
@@ -89,13 +88,12 @@ def together(comparison: Comparison) -> list[Table]:
         "steps (published.toml), only to bring tasks to one scale; it is of other env versions.",
         "Stratified bootstrap over the runs of each task, from ten seeds per task on.",
     ]
-    return [Table("All tasks together", headers, rows, notes, ledger(comparison.groups))]
+    return [Table("All tasks together", headers, rows, notes)]
 
 
 def best_of_two(comparison: Comparison) -> list[Table]:
     """What the better of two independent control runs, picked afterwards, would have scored."""
     rows: list[list[Cell]] = []
-    used: list[Group] = []
     for env in comparison.envs:
         control = comparison.find(env, comparison.reference)
         if control is None or len(control.runs) < 2 or len(control.budgets) > 1:
@@ -108,7 +106,6 @@ def best_of_two(comparison: Comparison) -> list[Table]:
         both = stats.best_of_two(control.values(comparison.metric))
         cells = [interval(found, after=f" ({split(env)[1]})") for found in (one, halves, both)]
         rows.append([word(env), number(len(control.runs)), count(budget), *cells])
-        used.append(control)
     if not rows:
         return []
     name = comparison.reference
@@ -116,18 +113,16 @@ def best_of_two(comparison: Comparison) -> list[Table]:
     notes = [
         f"Post hoc, from the finished {name} seeds: mean over all pairs of seeds of the larger "
         f"{comparison.metric} return, with a jackknife t interval. An ensemble has to beat this.",
-        "T/2 each spends the ledger of one run of T; T each spends it twice.",
+        "T/2 each costs what one run of T does; T each costs twice as much.",
     ]
-    return [Table("Best of two independent runs", headers, rows, notes, ledger(used))]
+    return [Table("Best of two independent runs", headers, rows, notes)]
 
 
 def selections(comparison: Comparison) -> list[Table]:
     """How sure selections were, and who descends from whom."""
     rows: list[list[Cell]] = []
-    used: list[Group] = []
     for group in comparison.groups:
-        chosen = [run for run in group.runs if run.selections]
-        for run in chosen:
+        for run in (run for run in group.runs if run.selections):
             found = lineage.Selections.of(run.selections)
             rows.append(
                 [
@@ -141,7 +136,6 @@ def selections(comparison: Comparison) -> list[Table]:
                     word(lineage.shorten(found.line)),
                 ]
             )
-        used += [group] if chosen else []
     if not rows:
         return []
     headers = ["env", "algorithm", "seed", "selections", "median gap / error", "coin flips"]
@@ -152,4 +146,4 @@ def selections(comparison: Comparison) -> list[Table]:
         "Founder: the member all descend from, and the selection since when. Line: the places "
         "through which the final champion descends, from the first selection to the last.",
     ]
-    return [Table("Selections", headers, rows, notes, ledger(used))]
+    return [Table("Selections", headers, rows, notes)]

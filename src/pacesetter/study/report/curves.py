@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pacesetter.study.compare import stats
-from pacesetter.study.compare.comparison import Comparison, Group
+from pacesetter.study.compare.groups import Comparison, Group
 from pacesetter.study.compare.results import Run
 from pacesetter.study.compare.stats import Array
 from pacesetter.study.report.contrasts import shared
 
-# Okabe and Ito's colours, which colour-blind people tell apart, without their yellow.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+# Okabe and Ito's colours, which colour-blind people tell apart, without their yellow, and with grey
+# for their black, which a dark page would swallow.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6F6F6F")
 DASHES = ("", "6 3", "2 2", "8 3 2 3")  # SVG; a second sign besides colour
 PAPER = {"multi-td3": 0, "td3": 1, "sunrise": 2}  # blue, red and green as in the paper's figure
 LEVELS = 101

@@ -1,4 +1,4 @@
-"""Curves on paper: a PDF of pages, and the paper's figure 2 in its layout."""
+"""Figures on paper: curves, intervals, profiles, and the paper's figure 2 in its layout."""
 
 from collections.abc import Mapping
 from datetime import datetime
@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pacesetter.study.compare.comparison import Comparison, split
+from pacesetter.study.compare import stats
+from pacesetter.study.compare.groups import Comparison, Group, split
 from pacesetter.study.compare.results import AXES
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
+from pacesetter.study.report.contents import NAMES, title
 from pacesetter.study.report.curves import Curve, curve, profiles, style
 from pacesetter.study.report.paper import TASKS
 from pacesetter.study.report.tables import steps
@@ -22,17 +24,39 @@ Styles = Mapping[str, tuple[str, str]]
 
 
 def pdf(comparison: Comparison, path: Path, window: int | None = None) -> None:
-    """A page of curves for each axis, the profiles, and figure 2 if there are runs for it."""
+    """A page of curves per axis, intervals, profiles, and figure 2 if there are runs for it."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     pages = [page(comparison, axis, window) for axis in AXES]
-    pages += [profile_page(comparison), figure_2(comparison, window)]
+    pages += [interval_page(comparison), profile_page(comparison), figure_2(comparison, window)]
     # A fixed date, so that the same runs give the same file.
     about: Any = {"CreationDate": datetime(2000, 1, 1), "Title": "pacesetter compare"}
     with PdfPages(path, metadata=about) as file:
         for figure in pages:
             if figure is not None:
                 file.savefig(figure)
+
+
+def picture(comparison: Comparison, path: Path, window: int | None = None) -> None:
+    """One PNG or SVG: below each task's curves its intervals."""
+    import matplotlib
+
+    envs = comparison.envs
+    columns = min(COLUMNS, len(envs))
+    rows = -(-len(envs) // columns)
+    figure, panels = _figure(2 * rows, columns)
+    for place in range(rows * columns):
+        row, column = 2 * (place // columns), place % columns
+        above, below = panels[row, column], panels[row + 1, column]
+        if place < len(envs):
+            _curves(above, comparison, envs[place], "steps", window)
+            _intervals(below, comparison, envs[place])
+        for panel in (above, below):
+            panel.set_visible(place < len(envs))
+    _head(figure, f"{title(comparison)}: mean over seeds and 95% t interval{_smoothed(window)}")
+    about = {"Date": None} if path.suffix == ".svg" else {}
+    with matplotlib.rc_context({"svg.hashsalt": "pacesetter"}):
+        figure.savefig(path, dpi=150, metadata=about)
 
 
 def _figure(rows: int, columns: int) -> tuple[Any, Any]:
@@ -55,22 +79,56 @@ def _figure(rows: int, columns: int) -> tuple[Any, Any]:
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
+def _panels(count: int) -> tuple[Any, list[Any]]:
+    """A figure with so many panels in rows of COLUMNS."""
+    columns = min(COLUMNS, count)
+    figure, panels = _figure(-(-count // columns), columns)
+    for panel in panels.flat[count:]:
+        panel.set_visible(False)
+    return figure, list(panels.flat[:count])
+
+
 def page(comparison: Comparison, axis: str, window: int | None = None) -> Any:
     """All tasks against one axis."""
-    envs, styles = comparison.envs, style(comparison.names)
-    columns = min(COLUMNS, len(envs))
-    figure, panels = _figure(-(-len(envs) // columns), columns)
-    for panel in panels.flat[len(envs) :]:
-        panel.set_visible(False)
-    for env, panel in zip(envs, panels.flat, strict=False):
-        for group in comparison.groups:
-            if group.env == env:
-                label = f"{group.name} (n={len(group.runs)})"
-                _draw(panel, curve(group, axis, window), styles[group.name], label)
-        _label(panel, env, AXES[axis], "return")
-        panel.legend(frameon=False, fontsize="small")
+    figure, panels = _panels(len(comparison.envs))
+    for env, panel in zip(comparison.envs, panels, strict=True):
+        _curves(panel, comparison, env, axis, window)
     _head(figure, f"Mean over seeds and 95% t interval{_smoothed(window)}")
     return figure
+
+
+def _curves(panel: Any, comparison: Comparison, env: str, axis: str, window: int | None) -> None:
+    styles = style(comparison.names)
+    for group in comparison.on(env):
+        label = f"{group.name} (n={len(group.runs)})"
+        _draw(panel, curve(group, axis, window), styles[group.name], label)
+    _label(panel, env, AXES[axis], "return")
+    panel.legend(frameon=False, fontsize="small")
+
+
+def interval_page(comparison: Comparison) -> Any:
+    """The metric of each algorithm on each task, with its interval."""
+    figure, panels = _panels(len(comparison.envs))
+    for env, panel in zip(comparison.envs, panels, strict=True):
+        _intervals(panel, comparison, env)
+    _head(figure, f"{NAMES[comparison.metric]}: mean over seeds, 95% t interval, and each seed")
+    return figure
+
+
+def _intervals(panel: Any, comparison: Comparison, env: str) -> None:
+    """A dot per algorithm with its interval as a bar, and a small ring per seed."""
+    styles, groups = style(comparison.names), comparison.on(env)
+    for place, group in enumerate(groups):
+        values = group.values(comparison.metric)
+        found, colour = stats.mean(values), styles[group.name][0]
+        panel.hlines(place, found.low, found.high, color=colour, linewidth=3, alpha=0.45)
+        panel.plot(values, [place] * len(values), "o", color=colour, fillstyle="none", markersize=4)
+        panel.plot(found.value, place, "o", color=colour, markersize=7)
+        label, across = f"{group.name} (n={len(group.runs)})", panel.get_yaxis_transform()
+        panel.text(0.01, place - 0.2, label, va="bottom", fontsize="x-small", transform=across)
+    panel.set_yticks([])
+    panel.set_ylim(len(groups) - 0.5, -0.8)
+    _label(panel, env, NAMES[comparison.metric].lower(), "")
 
 
 def profile_page(comparison: Comparison) -> Any:
@@ -89,34 +147,41 @@ def profile_page(comparison: Comparison) -> Any:
 
 
 def figure_2(comparison: Comparison, window: int | None = None) -> Any:
-    """The paper's figure 2: three tasks, SUNRISE above, TD3 below, Multi-TD3 in both; or None."""
-    names = {name for pair in FIGURE_2 for name in pair}
-    groups = [g for g in comparison.groups if g.name in names and split(g.env)[0] in TASKS]
-    if not {"multi-td3"} < {group.name for group in groups}:
+    """The paper's figure 2: SUNRISE above, TD3 below, Multi-TD3 in both; None without any pair.
+
+    Of its six panels only those are drawn for which there are runs of both algorithms.
+    """
+    found = [(task, pair) for pair in FIGURE_2 for task in TASKS]
+    shown = [(task, pair, _pair(comparison, task, pair)) for task, pair in found]
+    shown = [one for one in shown if {group.name for group in one[2]} == {*one[1]}]
+    if not shown:
         return None
     styles = style(comparison.names)
-    figure, panels = _figure(2, 3)
-    for row, pair in zip(panels, FIGURE_2, strict=True):
-        for task, panel in zip(TASKS, row, strict=True):
-            shown = [g for g in groups if split(g.env)[0] == task and g.name in pair]
-            end = min((curve(g, "steps").x[-1] for g in shown), default=0)
-            for group in shown:
-                line = _until(curve(group, "steps", window), end)
-                label = f"{group.name} ({split(group.env)[1]}, n={len(group.runs)})"
-                _draw(panel, line, styles[group.name], label)
-            title = f"{task}, {' and '.join(pair)}"
-            _label(panel, title, f"env steps to {steps(end)}" if shown else "", "return")
-            if shown:
-                panel.legend(frameon=False, fontsize="small")
-            else:
-                panel.text(0.5, 0.5, "no runs", ha="center", transform=panel.transAxes)
-                panel.set(xticks=[], yticks=[], ylabel="")
+    columns = [task for task in TASKS if any(task == one[0] for one in shown)]
+    rows = [pair for pair in FIGURE_2 if any(pair == one[1] for one in shown)]
+    figure, panels = _figure(len(rows), len(columns))
+    for panel in panels.flat:
+        panel.set_visible(False)
+    for task, pair, groups in shown:
+        panel = panels[rows.index(pair), columns.index(task)]
+        panel.set_visible(True)
+        end = min(curve(group, "steps").x[-1] for group in groups)
+        for group in groups:
+            line = _until(curve(group, "steps", window), end)
+            label = f"{group.name} ({split(group.env)[1]}, n={len(group.runs)})"
+            _draw(panel, line, styles[group.name], label)
+        _label(panel, f"{task}, {' and '.join(pair)}", f"env steps to {steps(end)}", "return")
+        panel.legend(frameon=False, fontsize="small")
     _head(
         figure,
         "The paper's figure 2: return against env steps of all members, mean over seeds and 95% t "
         f"interval{_smoothed(window)}",
     )
     return figure
+
+
+def _pair(comparison: Comparison, task: str, pair: tuple[str, str]) -> list[Group]:
+    return [g for g in comparison.groups if g.name in pair and split(g.env)[0] == task]
 
 
 def _head(figure: Any, text: str) -> None:
@@ -148,7 +213,10 @@ def _smoothed(window: int | None) -> str:
 def _draw(panel: Any, line: Curve, style: tuple[str, str], label: str) -> None:
     colour, dashes = style
     pattern = (0, tuple(int(n) / 2 for n in dashes.split())) if dashes else "-"
-    panel.plot(line.x, line.mean, color=colour, linestyle=pattern, label=label, linewidth=1.5)
+    mark = "o" if len(line.x) == 1 else None  # a line of one point is not seen
+    panel.plot(
+        line.x, line.mean, color=colour, linestyle=pattern, label=label, linewidth=1.5, marker=mark
+    )
     if np.isfinite(line.low).any():
         panel.fill_between(line.x, line.low, line.high, color=colour, alpha=0.18, linewidth=0)
 

@@ -1,16 +1,19 @@
 """A comparison written in the form that a file's name asks for."""
 
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 
 from pacesetter.errors import UsageError
 from pacesetter.storage import write_atomically
-from pacesetter.study.compare.comparison import Comparison
+from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
-from pacesetter.study.report import contents, contrasts, paper, tables
+from pacesetter.study.report import contents, contrasts, data, paper, tables
+from pacesetter.study.report.headline import headline
 from pacesetter.study.report.tables import Table
 
-SUFFIXES = (".html", ".md", ".tex", ".pdf")
+DRAWN = (".pdf", ".png", ".svg")
+SUFFIXES = (".html", ".md", ".tex", ".csv", ".json", *DRAWN)
 
 
 @dataclass(frozen=True)
@@ -41,19 +44,28 @@ def check(paths: list[str], options: Options) -> list[Path]:
 
 
 def text(comparison: Comparison, options: Options) -> str:
-    """For a terminal: the table of the metric, what speaks against it, and on request the paper."""
+    """For a terminal: the result, the table of the metric, what speaks against it, the ledger."""
     shown = [contents.overview(comparison), *contrasts.against(comparison)]
+    shown += [contents.ledger(comparison.groups)]
     shown += paper.tables(comparison) if options.published else []
-    return "\n\n".join([tables.plain(shown), *comparison.notes])
+    return "\n\n".join([headline(comparison), tables.plain(shown), *comparison.notes])
+
+
+def notebook(comparison: Comparison) -> str:
+    """For a notebook: the result, the table of the metric and what a reader must be told."""
+    words = [headline(comparison), *comparison.notes]
+    found = [f"<p>{escape(line)}</p>" for line in words]
+    return "\n".join([found[0], tables.grid(contents.overview(comparison), "html"), *found[1:]])
 
 
 def write(comparison: Comparison, path: Path, options: Options) -> None:
     """One file; UsageError where it cannot be written."""
     try:
-        if path.suffix == ".pdf":
-            from pacesetter.study.report.figures import pdf
+        if path.suffix in DRAWN:
+            from pacesetter.study.report import figures
 
-            pdf(comparison, path, options.smooth)
+            draw = figures.pdf if path.suffix == ".pdf" else figures.picture
+            draw(comparison, path, options.smooth)
         else:
             write_atomically(path, _page(comparison, path.suffix, options).encode())
     except OSError as error:
@@ -61,23 +73,24 @@ def write(comparison: Comparison, path: Path, options: Options) -> None:
 
 
 def _page(comparison: Comparison, suffix: str, options: Options) -> str:
-    shown = everything(comparison, options)
+    if suffix in (".json", ".csv"):
+        return data.as_json(comparison) if suffix == ".json" else data.as_csv(comparison)
+    beside = paper.tables(comparison) if options.published else []
     if suffix == ".html":
+        from pacesetter.study.report.films import films
         from pacesetter.study.report.html import report
 
-        film, allow = options.film, options.allow
-        return report(comparison, shown, window=options.smooth, film=film, allow=allow)
-    heading, notes = contents.title(comparison), comparison.notes
-    shown.append(contents.runs(comparison))
-    if suffix == ".md":
-        return tables.markdown(heading, notes, shown)
-    return tables.latex(heading, notes, shown)
+        filmed = list(films(comparison, options.allow)) if options.film else []
+        return report(comparison, own(comparison), beside, filmed, options.smooth)
+    write = tables.markdown if suffix == ".md" else tables.latex
+    shown = [*own(comparison), *beside, contents.runs(comparison)]
+    return write(contents.title(comparison), headline(comparison), comparison.notes, shown)
 
 
-def everything(comparison: Comparison, options: Options) -> list[Table]:
-    """All tables that these runs can fill, the one of the metric first, but that of single runs."""
-    found = [contents.overview(comparison), contents.details(comparison)]
-    found += [contents.speed(comparison), *contrasts.against(comparison)]
+def own(comparison: Comparison) -> list[Table]:
+    """All tables that these runs alone can fill, but that of single runs; the metric's first."""
+    found = [contents.overview(comparison), *contrasts.against(comparison)]
+    found += [contents.details(comparison), contents.speed(comparison)]
     found += [*contrasts.together(comparison), *contrasts.best_of_two(comparison)]
     found += contrasts.selections(comparison)
-    return found + (paper.tables(comparison) if options.published else [])
+    return [*found, contents.ledger(comparison.groups)]

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from pacesetter.study.compare import stats
-from pacesetter.study.compare.comparison import METRICS, Comparison, Group, split
-from pacesetter.study.report.contents import about, ledger
+from pacesetter.study.compare.groups import METRICS, Comparison, Group, split
+from pacesetter.study.report.contents import about
 from pacesetter.study.report.published import Source, sources
 from pacesetter.study.report.tables import Cell, Table, count, number, spread, steps, word
 
@@ -45,7 +45,7 @@ def paper_table(comparison: Comparison, which: str) -> Table | None:
         "metrics do not measure the same thing.",
     ]
     title = f"The paper's table {which}"
-    return Table(title, ["algorithm", "source", *TASKS], rows, notes, ledger(groups))
+    return Table(title, ["algorithm", "source", *TASKS], rows, notes)
 
 
 def _on_tasks(source: Source) -> bool:
@@ -54,7 +54,8 @@ def _on_tasks(source: Source) -> bool:
 
 
 def _printed(source: Source) -> list[Cell]:
-    row = [word(source["algorithm"]), word(f"{source['who']}, {source['metric']}")]
+    who = Cell(f"{source['who']}, {source['metric']}", url=source.get("url", ""))
+    row = [word(source["algorithm"]), who]
     said = source.get("said") or steps(source["budget"])
     seeds = f", n={source['seeds']}" if "seeds" in source else ""
     for task in TASKS:
@@ -90,7 +91,7 @@ def _mean(group: Group, metric: str, after: str) -> Cell:
 def published(comparison: Comparison) -> Table | None:
     """What others report on these tasks, beside the groups; a learning curve at our budget."""
     rows: list[list[Cell]] = []
-    used: list[Group] = []
+    found: list[str] = []
     for group in comparison.groups:
         task, version = split(group.env)
         if any(task in source["returns"] for source in sources()):
@@ -98,10 +99,10 @@ def published(comparison: Comparison) -> Table | None:
             row += [word(f"{comparison.metric}, seeds"), number(len(group.runs))]
             budget = count(group.budgets[0]) if len(group.budgets) == 1 else word("mixed")
             rows.append([word(task), word(group.name), *row, budget, word("ours")])
-            used.append(group)
-    for task in dict.fromkeys(split(group.env)[0] for group in used):
+            found.append(task)
+    for task in dict.fromkeys(found):
         rows += [row for source in sources() for row in _rows(source, task, comparison.budget)]
-    if not used:
+    if not found:
         return None
     headers = ["task", "algorithm", "return (env version)", "metric, ± over"]
     headers += ["n", "steps", "source"]
@@ -112,7 +113,7 @@ def published(comparison: Comparison) -> Table | None:
         "seeds."
     ]
     rows = sorted(rows, key=lambda row: (row[0].text, row[6].text != "ours"))
-    return Table("Published returns", headers, rows, notes, ledger(used))
+    return Table("Published returns", headers, rows, notes)
 
 
 def _rows(source: Source, task: str, budget: int | None) -> Iterator[list[Cell]]:
@@ -131,5 +132,5 @@ def _rows(source: Source, task: str, budget: int | None) -> Iterator[list[Cell]]
         word(f"{source['metric']}{over}"),
         number(source.get("seeds", np.nan)),
         count(at),
-        word(source["cite"]),
+        Cell(source["cite"], url=source.get("url", "")),
     ]

@@ -25,6 +25,14 @@ for (const cell of document.querySelectorAll("td")) {
   if (cell.textContent.length > 25 && !cell.querySelector("small")) cell.classList.add("long");
 }
 
+// A shadow where a table goes on beyond its right edge.
+for (const inner of document.querySelectorAll(".scroll")) {
+  const look = () => inner.parentElement.classList.toggle("more",
+    inner.scrollLeft + inner.clientWidth < inner.scrollWidth - 2);
+  inner.addEventListener("scroll", look, { passive: true });
+  new ResizeObserver(look).observe(inner);
+}
+
 // Charts.
 const data = JSON.parse(document.getElementById("data").textContent);
 const HEIGHT = 340, LEFT = 62, RIGHT = 14, TOP = 10, BOTTOM = 46;
@@ -41,13 +49,15 @@ function element(name, attributes = {}, parent = null, text = "") {
   return made;
 }
 
-function short(value) {
-  const size = Math.abs(value);
+// Three digits and a unit; numbers of one axis share the unit of its largest.
+function short(value, largest = value) {
+  if (value === 0) return "0";
+  const size = Math.abs(largest);
   const digits = (number) => String(Number(number.toPrecision(3)));
   if (size >= 1e9) return digits(value / 1e9) + "G";
   if (size >= 1e6) return digits(value / 1e6) + "M";
   if (size >= 1e4) return digits(value / 1e3) + "k";
-  return size >= 100 ? String(Math.round(value)) : digits(value);
+  return Math.abs(value) >= 100 ? String(Math.round(value)) : digits(value);
 }
 
 function ticks(low, high, count = 5) {
@@ -120,17 +130,19 @@ class Chart {
   }
 
   frame(bottom, top) {
+    const reach = Math.max(Math.abs(bottom), Math.abs(top));
     for (const at of ticks(bottom, top)) {
       const y = this.y(at);
       element("line", { class: "grid", x1: LEFT, x2: this.width - RIGHT, y1: y, y2: y }, this.svg);
-      element("text", { x: LEFT - 6, y: y + 4, "text-anchor": "end" }, this.svg, short(at));
+      element("text", { x: LEFT - 6, y: y + 4, "text-anchor": "end" }, this.svg,
+        short(at, reach));
     }
     for (const at of ticks(this.low, this.high, this.width / 110)) {
       const x = this.x(at);
       const end = HEIGHT - BOTTOM;
       element("line", { class: "grid", x1: x, x2: x, y1: TOP, y2: end }, this.svg);
       const anchor = x > this.width - RIGHT - 16 ? "end" : "middle";
-      element("text", { x, y: end + 17, "text-anchor": anchor }, this.svg, short(at));
+      element("text", { x, y: end + 17, "text-anchor": anchor }, this.svg, short(at, this.high));
     }
     const middle = (LEFT + this.width - RIGHT) / 2;
     element("text", { x: middle, y: HEIGHT - 8, "text-anchor": "middle" }, this.svg,
@@ -142,6 +154,10 @@ class Chart {
 
   stroke(name, xs, ys, opacity, width) {
     const [colour, dashes] = data.styles[name];
+    if (xs.length === 1) {  // a line of one point is not seen
+      const [cx, cy] = [this.x(xs[0]), this.y(ys[0])];
+      element("circle", { cx, cy, r: 4, fill: colour, "fill-opacity": opacity }, this.svg);
+    }
     element("path", { d: path(xs, ys, this.x, this.y), fill: "none", stroke: colour,
       "stroke-width": width, "stroke-opacity": opacity, "stroke-dasharray": dashes,
       "stroke-linejoin": "round" }, this.svg);
@@ -169,27 +185,40 @@ class Chart {
     this.read(from + way * small);
   }
 
-  // Show the values of all lines at a place on the x axis, interpolated between evaluations.
+  // Show the values of all lines at a place on the x axis, or where no place is meant, at their end.
   read(at) {
     this.at = at === null ? null : Math.min(Math.max(at, this.low), this.high);
     this.cursor.replaceChildren();
     this.values.replaceChildren();
-    if (this.at === null) return;
-    const x = this.x(this.at);
-    element("line", { class: "cursor", x1: x, x2: x, y1: TOP, y2: HEIGHT - BOTTOM }, this.cursor);
-    element("span", {}, this.values, `${this.spec.axes[this.axis].split(":")[0]} ${short(this.at)}`);
-    for (const [name, [xs, mean, low, high]] of this.lines) {
-      if (xs.length < 2 || this.at < xs[0] || this.at > xs[xs.length - 1]) continue;
-      const next = Math.max(1, xs.findIndex((value) => value >= this.at));
-      const part = (this.at - xs[next - 1]) / (xs[next] - xs[next - 1]);
-      const mix = (ys) => (ys[next] === null ? null : ys[next - 1] + part * (ys[next] - ys[next - 1]));
-      const colour = data.styles[name][0];
-      element("circle", { cx: x, cy: this.y(mix(mean)), r: 4, fill: colour }, this.cursor);
-      const words = element("span", {}, this.values);
-      element("i", { style: `background:${colour}` }, words);
-      const band = mix(low) === null ? "" : ` [${short(mix(low))}; ${short(mix(high))}]`;
-      words.append(`${name} ${short(mix(mean))}${band}`);
+    const label = this.spec.axes[this.axis].split(":")[0];
+    if (this.at !== null) {
+      const x = this.x(this.at);
+      element("line", { class: "cursor", x1: x, x2: x, y1: TOP, y2: HEIGHT - BOTTOM }, this.cursor);
+      element("span", {}, this.values, `${label} ${short(this.at)}`);
+    } else if (this.axis === "profile") {
+      return;
+    } else {
+      element("span", {}, this.values, "at the end");
     }
+    for (const [name, line] of this.lines) this.tell(name, line);
+  }
+
+  // One line's value at the place, interpolated between evaluations.
+  tell(name, [xs, mean, low, high]) {
+    const last = xs.length - 1, at = this.at === null ? xs[last] : this.at;
+    if (at < xs[0] || at > xs[last]) return;
+    const next = Math.max(1, xs.findIndex((value) => value >= at));
+    const part = last ? (at - xs[next - 1]) / (xs[next] - xs[next - 1]) : 0;
+    const mix = (ys) => (ys[last] === null || !last ? ys[last]
+      : ys[next - 1] + part * (ys[next] - ys[next - 1]));
+    const colour = data.styles[name][0];
+    if (this.at !== null) {
+      element("circle", { cx: this.x(at), cy: this.y(mix(mean)), r: 4, fill: colour }, this.cursor);
+    }
+    const words = element("span", {}, this.values);
+    element("i", { style: `background:${colour}` }, words);
+    const band = mix(low) === null ? "" : ` [${short(mix(low))}; ${short(mix(high))}]`;
+    words.append(`${name} ${short(mix(mean))}${band}`);
   }
 }
 

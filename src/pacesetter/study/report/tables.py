@@ -1,7 +1,7 @@
-"""Tables as data, and as plain text, Markdown or LaTeX; each ends in its ledger and its notes."""
+"""Tables as data, and as plain text, Markdown or LaTeX; each ends in its notes."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,21 +11,21 @@ from pacesetter.study.compare.stats import Interval
 
 
 class Cell(NamedTuple):
-    """What is shown, and the number it is sorted by."""
+    """What is shown, the number it is sorted by, and the page where it is from."""
 
     text: str
     key: float | None = None
+    url: str = ""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Headers and rows; the ledger says what the runs in it have spent."""
+    """Headers, rows and the small print below them."""
 
     title: str
     headers: list[str]
     rows: list[list[Cell]]
     notes: list[str] = field(default_factory=list[str])
-    ledger: "Table | None" = None
 
 
 def word(text: object) -> Cell:
@@ -69,7 +69,31 @@ def steps(count: float) -> str:
 def grid(table: Table, form: str) -> str:
     """Headers and rows alone, in one of tabulate's formats."""
     rows = [[cell.text for cell in row] for row in table.rows]
-    return tabulate(rows, table.headers, tablefmt=form, disable_numparse=True)
+    sides = ["right" if numeric(table, place) else "left" for place in range(len(table.headers))]
+    return tabulate(rows, table.headers, tablefmt=form, disable_numparse=True, colalign=sides)
+
+
+def numeric(table: Table, place: int) -> bool:
+    """Whether a column holds numbers, which stand to the right."""
+    column = [row[place] for row in table.rows]
+    return any(cell.key is not None for cell in column) and all(
+        cell.key is not None or cell.text == "-" for cell in column
+    )
+
+
+def merge(table: Table, alone: bool) -> Table:
+    """Task and algorithm in one first column, which stays where a narrow screen scrolls.
+
+    Where one task is alone the page's title names it, and the column only the algorithm.
+    """
+    if table.headers[:2] not in (["env", "algorithm"], ["task", "algorithm"]):
+        return table
+    rows = [
+        [name if alone else Cell(f"{name.text} ({env.text})"), *rest]
+        for env, name, *rest in table.rows
+    ]
+    first = "algorithm" if alone else f"algorithm ({table.headers[0]})"
+    return replace(table, headers=[first, *table.headers[2:]], rows=rows)
 
 
 def plain(tables: Iterable[Table]) -> str:
@@ -79,18 +103,14 @@ def plain(tables: Iterable[Table]) -> str:
 
 def _plain(table: Table) -> list[str]:
     lines = [table.title, "", grid(table, "plain")]
-    if table.ledger:
-        lines += ["", table.ledger.title, grid(table.ledger, "plain")]
     return lines + ([""] if table.notes else []) + table.notes
 
 
-def markdown(title: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
-    """A page of Markdown."""
-    parts = [f"# {title}", *([_list(notes)] if notes else [])]
+def markdown(title: str, result: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
+    """A page of Markdown, whose first sentence is the result."""
+    parts = [f"# {title}", result, *([_list(notes)] if notes else [])]
     for table in tables:
         parts += [f"## {table.title}", grid(table, "github")]
-        if table.ledger:
-            parts += [f"{table.ledger.title}:", grid(table.ledger, "github")]
         if table.notes:
             parts.append(_list(table.notes))
     return "\n\n".join(parts) + "\n"
@@ -100,16 +120,13 @@ def _list(lines: Sequence[str]) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def latex(title: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
+def latex(title: str, result: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
     """Tables for `\\input`; needs booktabs and graphicx."""
     parts = [f"% {title}. Needs \\usepackage{{booktabs,graphicx}}."]
-    parts += [f"% {line}" for line in notes]
+    parts += [f"% {line}" for line in (result, *notes)]
     for table in tables:
         parts += ["\\begin{table}", "\\centering", f"\\caption{{{escape(table.title)}}}"]
         parts.append(_fit(grid(table, "latex_booktabs")))
-        if table.ledger:
-            parts += ["", "\\smallskip", f"{escape(table.ledger.title)}", ""]
-            parts.append(_fit(grid(table.ledger, "latex_booktabs")))
         parts += [f"\n\\footnotesize {escape(' '.join(table.notes))}"] if table.notes else []
         parts.append("\\end{table}\n")
     return "\n".join(parts)

@@ -1,0 +1,117 @@
+"""The result of a comparison in one sentence."""
+
+import numpy as np
+
+from pacesetter.study.compare import stats
+from pacesetter.study.compare.groups import Comparison, Group
+from pacesetter.study.compare.stats import Interval
+from pacesetter.study.report.contents import NAMES
+from pacesetter.study.report.tables import steps
+
+MOST = 6  # algorithms that a sentence names
+
+
+def headline(comparison: Comparison) -> str:
+    """Who is ahead, by how much, and whether these runs can tell."""
+    if len(comparison.groups) == 1:
+        return _alone(comparison.groups[0], comparison.metric)
+    if len(comparison.envs) == 1:
+        return _best(comparison)
+    return _tally(comparison) or _leaders(comparison)
+
+
+def _alone(group: Group, metric: str) -> str:
+    found = stats.mean(group.values(metric))
+    return (
+        f"{group.name} on {group.env} has a {NAMES[metric].lower()} of "
+        f"{found.value:,.0f}{_within(found)} ({_made(group)})."
+    )
+
+
+def _best(comparison: Comparison) -> str:
+    """The best algorithm of one task against the next."""
+    metric = comparison.metric
+    ranked = sorted(comparison.groups, key=lambda group: -_mean(group, metric))
+    best, second = ranked[:2]
+    gap = stats.difference(best.values(metric), second.values(metric))
+    many = f" of {len(ranked)} algorithms" if len(ranked) > 2 else ""
+    return (
+        f"On {best.env}, {best.name} has the highest {NAMES[metric].lower()}{many}, "
+        f"{_mean(best, metric):,.0f} against {_mean(second, metric):,.0f} of {second.name}"
+        f"{_verdict(gap, min(len(best.runs), len(second.runs)))} "
+        f"({best.name}: {_made(best)}; {second.name}: {_made(second)})."
+    )
+
+
+def _verdict(gap: Interval, seeds: int) -> str:
+    few = f", though fewer than {stats.FEWEST_SEEDS} seeds are only indicative"
+    if np.isnan(gap.low):
+        return "; one run of an algorithm cannot tell this from chance"
+    reach = f"the 95% interval of the difference is {gap.low:,.0f} to {gap.high:,.0f}"
+    if gap.low <= 0 <= gap.high:
+        return f", but these runs cannot tell the two apart: {reach}"
+    return f", a difference beyond chance: {reach}{few if seeds < stats.FEWEST_SEEDS else ''}"
+
+
+def _tally(comparison: Comparison) -> str:
+    """On how many tasks each algorithm is ahead of the control; empty without a control."""
+    counts: dict[str, list[int]] = {}
+    for group in comparison.groups:
+        control = comparison.find(group.env, comparison.reference)
+        if control is not None and control is not group:
+            x, y = group.values(comparison.metric), control.values(comparison.metric)
+            low, high = stats.difference(x, y)[1:]
+            place = 0 if low > 0 else 1 if high < 0 else 2
+            counts.setdefault(group.name, [0, 0, 0])[place] += 1
+    if not counts:
+        return ""
+    words = [f"{name} is {_places(places)}" for name, places in [*counts.items()][:MOST]]
+    more = f"; {len(counts) - MOST} more are in the table" if len(counts) > MOST else ""
+    few = comparison.seeds < stats.FEWEST_SEEDS
+    return (
+        f"Against {comparison.reference}, by the 95% interval of the difference in "
+        f"{NAMES[comparison.metric].lower()}: {'; '.join(words)}{more}"
+        f"{', all indicative where seeds are few' if few else ''}."
+    )
+
+
+def _places(counts: list[int]) -> str:
+    total = sum(counts)
+    words = ("ahead", "behind", "not told apart")
+    found = [
+        f"{word} on {count} of {total} task{'s' if total > 1 else ''}"
+        for word, count in zip(words, counts, strict=True)
+        if count
+    ]
+    return " and ".join(found)
+
+
+def _leaders(comparison: Comparison) -> str:
+    """How many tasks each algorithm leads, where there is no control."""
+    metric, led = comparison.metric, dict[str, int]()
+    for env in comparison.envs:
+        groups = [group for group in comparison.groups if group.env == env]
+        name = max(groups, key=lambda group: _mean(group, metric)).name
+        led[name] = led.get(name, 0) + 1
+    ranked = sorted(led.items(), key=lambda item: -item[1])[:MOST]
+    words = ", ".join(f"{name} on {count}" for name, count in ranked)
+    return (
+        f"The highest {NAMES[metric].lower()} of {len(comparison.envs)} tasks: {words}; "
+        f"{comparison.reference} is not among the runs, so no difference is tested."
+    )
+
+
+def _mean(group: Group, metric: str) -> float:
+    """Mean over seeds; what is not known comes last."""
+    value = float(group.values(metric).mean())
+    return value if np.isfinite(value) else -np.inf
+
+
+def _within(found: Interval) -> str:
+    return "" if np.isnan(found.low) else f" (95% interval {found.low:,.0f} to {found.high:,.0f})"
+
+
+def _made(group: Group) -> str:
+    runs = len(group.runs)
+    budget = " and ".join(steps(count) for count in group.budgets)
+    return f"{runs} run{'s' if runs > 1 else ''} of {budget} steps"

@@ -1,0 +1,46 @@
+"""The first sentence of a comparison: who is ahead, and whether the runs can tell."""
+
+from pathlib import Path
+
+import pytest
+from compare import make_run
+
+from pacesetter.study.compare.comparison import compare
+from pacesetter.study.report.headline import headline
+
+
+def runs(folder: Path, levels: dict[str, float], seeds: int, env: str = "Ant-v5") -> None:
+    for name, level in levels.items():
+        for seed in range(seeds):
+            make_run(folder, env, name, seed, level=level, budget=20_000, evaluations=10)
+
+
+@pytest.mark.parametrize(
+    ("levels", "seeds", "said"),
+    [
+        ({"td3": 1_000}, 1, ["td3 on Ant-v5 has a final return of", "(1 run of 20k steps)"]),
+        ({"td3": 1_000, "sac": 2_000}, 1, ["sac has the highest", "cannot tell this from chance"]),
+        ({"td3": 1_000, "sac": 1_010}, 3, ["cannot tell the two apart", "3 runs of 20k steps"]),
+        ({"td3": 1_000, "sac": 9_000}, 3, ["sac", "beyond chance", "fewer than 5 seeds"]),
+        ({"td3": 1_000, "sac": 9_000}, 5, ["highest final return, ", "beyond chance"]),
+        ({"td3": 9_000, "sac": 5, "crossq": 50}, 5, ["td3 has the", "of 3 algorithms"]),
+    ],
+)
+def test_one_task(levels: dict[str, float], seeds: int, said: list[str], tmp_path: Path) -> None:
+    runs(tmp_path, levels, seeds)
+    line = headline(compare([tmp_path]))
+    assert [word for word in said if word not in line] == []
+    assert ("indicative" in line) == (seeds == 3 and "beyond" in line)
+    assert (line[-1], line.count(". ")) == (".", 0)
+
+
+def test_several_tasks_are_counted_against_the_control(tmp_path: Path) -> None:
+    runs(tmp_path, {"td3": 1_000, "sac": 9_000, "multi-td3": 100}, 5)
+    runs(tmp_path, {"td3": 1_000, "sac": 9_000, "multi-td3": 1_000}, 5, "Walker2d-v5")
+    line = headline(compare([tmp_path]))
+    assert "sac is ahead on 2 of 2 tasks" in line
+    assert "multi-td3 is behind on 1 of 2 tasks and not told apart on 1 of 2 tasks" in line
+    assert "indicative" not in line
+    without = headline(compare([tmp_path], reference="ddpg"))
+    assert "sac on 2" in without
+    assert "ddpg is not among the runs" in without
