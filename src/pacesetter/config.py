@@ -41,6 +41,14 @@ class Task:
     time: Duration | None = Field(
         None, gt=0, description="stop after this wall time, such as 2h; default no limit"
     )
+    stop_at: float | None = Field(
+        None, description="stop at the first evaluation whose mean return is this; default never"
+    )
+    start_from: str | None = Field(
+        None,
+        min_length=1,
+        description="earlier run, or policy file, whose networks the members start with",
+    )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
 
 
@@ -50,6 +58,9 @@ class Run(Ensemble, Task):
 
     eval_every: Count = Field(5_000, ge=1, description="env steps between evaluations")
     eval_episodes: int = Field(10, ge=1, description="episodes per evaluation")
+    keep: int = Field(
+        0, ge=0, description="policies of the last evaluations to keep in the folder policies/"
+    )
     checkpoint_every: Duration = Field(
         60.0, gt=0, description="time between checkpoints, such as 5m"
     )

@@ -12,7 +12,7 @@ import numpy as np
 from pacesetter.batch import Batch, Spec
 from pacesetter.errors import UsageError
 from pacesetter.policy import Actors
-from pacesetter.types import Floats
+from pacesetter.types import Floats, Layers
 
 Array = jax.Array
 State = Any  # a NamedTuple of arrays
@@ -91,6 +91,13 @@ class Learner:
     def ledger(self, states: Sequence[State], updates: int, actions: int) -> dict[str, int]:
         """What so many updates and actions cost besides the members' own; nothing by default."""
         return {}
+
+    def with_actor(self, state: State, layers: Layers) -> State:
+        """The state with the actor of a policy file (`--start-from FILE`)."""
+        raise UsageError(
+            f"start_from: {type(self).__name__} cannot take the actor of a policy file; name the "
+            "run that it comes from"
+        )
 
     def copy_weights(self, own: State, parent: State) -> State:
         """The parent's networks with the member's own optimiser state (`--copy weights`)."""

@@ -23,7 +23,7 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
+from pacesetter.algorithms.contract import Array, Learner, Update, each_minibatch, last_minibatch
 from pacesetter.algorithms.stochastic import Exploration, StochasticLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
@@ -129,6 +129,8 @@ class CrossQ(StochasticLearner):
 
     def policy_params(self, state: State) -> mlp.Network:
         return batch_renorm.fold(state.actor)
+
+    with_actor = Learner.with_actor  # a policy file holds its batch norm folded into the layers
 
     def policy(self, state: State) -> Actors:
         return gaussian.mean_policy(batch_renorm.fold(state.actor), self.spec.action_size)

@@ -10,7 +10,7 @@ import numpy as np
 from pacesetter.algorithms.contract import Learner
 from pacesetter.networks import exploration, mlp
 from pacesetter.policy import Actors
-from pacesetter.types import Floats
+from pacesetter.types import Floats, Layers
 
 
 class DeterministicLearner(Learner):
@@ -40,6 +40,10 @@ class DeterministicLearner(Learner):
     def policy(self, state: Any) -> Actors:
         one = jax.tree.map(lambda x: x[None], state.actor)
         return Actors(one, activation="relu", output="tanh")
+
+    def with_actor(self, state: Any, layers: Layers) -> Any:
+        actor = mlp.replaced(state.actor, layers)
+        return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
 
     def copy_weights(self, own: Any, parent: Any) -> Any:
         return parent._replace(

@@ -47,6 +47,15 @@ class StochasticLearner(Learner):
         )
         return state._replace(log_alpha=log_alpha, alpha_opt_state=opt_state)
 
+    def with_actor(self, state: Any, layers: Layers) -> Any:
+        """Its mean; the standard deviation, which a policy file has not, starts anew."""
+        *_, last = state.actor
+        size = self.spec.action_size
+        spread = {name: np.asarray(value)[..., size:] for name, value in last.items()}
+        *hidden, mean = layers
+        joined = {name: np.concatenate([mean[name], spread[name]], axis=-1) for name in mean}
+        return state._replace(actor=mlp.replaced(state.actor, [*hidden, joined]))
+
     def copy_weights(self, own: Any, parent: Any) -> Any:
         return parent._replace(
             actor_opt_state=own.actor_opt_state,

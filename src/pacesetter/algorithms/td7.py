@@ -23,7 +23,7 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
+from pacesetter.algorithms.contract import Array, Learner, Update, each_minibatch, last_minibatch
 from pacesetter.algorithms.deterministic import DeterministicLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.errors import UsageError
@@ -250,6 +250,8 @@ class TD7(DeterministicLearner):
         actor, _ = self.policy_params(state)
         one = jax.tree.map(lambda x: x[None], actor)
         return Actors(one, activation="relu", output="tanh")
+
+    with_actor = Learner.with_actor  # an actor reads the encoder that its critics read too
 
     def copy_weights(self, own: State, parent: State) -> State:
         copied = super().copy_weights(own, parent)

@@ -57,7 +57,8 @@ def state(run: RunDirectory) -> Row:
     """How far a run is, and whether it is running, finished or stopped."""
     settings, rows = run.settings(), run.rows()
     last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
-    over = is_spent(settings, last["step"], last["wall_seconds"])
+    means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
+    over = is_spent(settings, last["step"], last["wall_seconds"], max(means, default=None))
     name = "running" if run.in_use() else "finished" if over else "stopped"
     return {"step": last["step"], "budget": budget(settings), "state": name}
 

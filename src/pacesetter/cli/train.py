@@ -86,6 +86,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
     command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
     command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
+    goal = "new mean return to stop at"
+    command.add_argument("--stop-at", type=float, metavar="RETURN", help=goal)
     command.add_allow()
     command.add_runs()
     command.add_log()
@@ -96,9 +98,10 @@ def _resumed_trainer(words: list[str]) -> Command:
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    given = {"steps": found.steps, "time": found.time, "allow": found.allow}
+    given = {"steps": found.steps, "time": found.time, "stop_at": found.stop_at}
     with aside():
-        return Command(Trainer.resume(directory.path, **given), found.quiet, log)
+        trainer = Trainer.resume(directory.path, allow=found.allow, **given)
+    return Command(trainer, found.quiet, log)
 
 
 def name_of(path: Path) -> str:

@@ -5,7 +5,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+
+from pacesetter.types import Layers
 
 Array = jax.Array
 Layer = dict[str, Array]
@@ -134,3 +137,15 @@ def apply_gradient(
     """One optimiser step: the new parameters and optimiser state."""
     change, opt_state = optimizer.update(gradient, opt_state, params)
     return optax.apply_updates(params, change), opt_state
+
+
+def replaced(network: Network, layers: Layers) -> Network:
+    """The network with other layers of the same shapes; a ValueError says what does not fit."""
+    shapes = [
+        [{name: np.shape(value) for name, value in layer.items()} for layer in each]
+        for each in (network, layers)
+    ]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"its layers have shapes {shapes[1]}, this run's {shapes[0]}")
+    leaves = [jnp.array(leaf) for leaf in jax.tree.leaves(list(layers))]
+    return jax.tree.unflatten(jax.tree.structure(network), leaves)

@@ -1,4 +1,4 @@
-"""What a run may spend, read off its flat settings: env steps, and time if it is limited."""
+"""What a run may spend, read off its flat settings: env steps, time, and a return to stop at."""
 
 from pacesetter.settings import Settings
 
@@ -19,6 +19,16 @@ def out_of_time(settings: Settings, wall_seconds: float) -> bool:
     return limit is not None and wall_seconds >= limit
 
 
-def is_spent(settings: Settings, step: float, wall_seconds: float) -> bool:
-    """Whether a run has made all its env steps or is out of time."""
-    return step >= budget(settings) or out_of_time(settings, wall_seconds)
+def is_reached(settings: Settings, best: float | None) -> bool:
+    """Whether a run has a return to reach and an evaluation's mean has reached it."""
+    goal = settings.get("stop_at")
+    return goal is not None and best is not None and best >= goal
+
+
+def is_spent(settings: Settings, step: float, wall_seconds: float, best: float | None) -> bool:
+    """Whether a run has made all its env steps, is out of time, or has reached its return.
+
+    `best` is the highest mean return of its evaluations.
+    """
+    over = step >= budget(settings) or out_of_time(settings, wall_seconds)
+    return over or is_reached(settings, best)

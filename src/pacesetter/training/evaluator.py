@@ -1,5 +1,6 @@
 """Evaluations of a run on starts that training never uses, and the policy files they write."""
 
+from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config
@@ -54,6 +55,8 @@ class Evaluator:
         score = {"score": trial.mean, "score_std": trial.std, "score_episodes": episodes}
         policy.about.update(score)
         policy.save(self.directory.policy_file)
+        if keep := self.config.run.keep:
+            _keep(policy, self.directory.path / "policies", progress.step, keep)
         if progress.step > 0 and (progress.best is None or trial.mean > progress.best):
             progress.best = trial.mean
             policy.about["score_note"] = "the best of many evaluations, so biased upwards"
@@ -73,3 +76,12 @@ class Evaluator:
             self._env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
         with blame(member, self.loop.progress.step):
             return rollouts(act, self._env, run.eval_episodes)
+
+
+def _keep(policy: Policy, folder: Path, step: int, most: int) -> None:
+    """Write the policy of a step, and remove the oldest beyond so many."""
+    folder.mkdir(exist_ok=True)
+    policy.save(folder / f"step-{step}.safetensors")
+    kept = {int(file.stem[5:]): file for file in folder.glob("step-[0-9]*.safetensors")}
+    for old in sorted(kept)[:-most]:
+        kept[old].unlink()

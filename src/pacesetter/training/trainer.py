@@ -16,12 +16,13 @@ from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
-from pacesetter.settings.budget import out_of_time
+from pacesetter.settings.budget import is_reached, out_of_time
 from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint
 from pacesetter.training.evaluator import Evaluator
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
+from pacesetter.training.starting import start_from
 
 
 class Trainer:
@@ -46,6 +47,8 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
         self._begin()
+        if self.config.run.start_from is not None:
+            start_from(self.loop, self.config, runs)
         self.directory.create(self.config, **made_with(products.of(self.config.hyper)))
         try:
             self.loop.open_replays(self.directory.state_file.parent)
@@ -63,6 +66,7 @@ class Trainer:
         runs: str | Path = "runs",
         steps: int | str | None = None,
         time: float | str | None = None,
+        stop_at: float | None = None,
         allow: Iterable[str] = (),
     ) -> Self:
         """Take up a run where its last checkpoint left it, with a new budget if one is given.
@@ -72,7 +76,7 @@ class Trainer:
         self = cls.__new__(cls)
         self.directory = find(str(run), runs)
         self.config = self.directory.config(allow)
-        budgets = {"steps": steps, "time": time}
+        budgets = {"steps": steps, "time": time, "stop_at": stop_at}
         changed = {key: value for key, value in budgets.items() if value is not None}
         if changed:
             settings = self.config.settings() | changed
@@ -121,7 +125,7 @@ class Trainer:
                 self._report_what_is_due(ending)
                 reports, self._reports = self._reports, []
                 yield from reports
-                if ending or self._stopping:
+                if ending or self._stopping or self._reached:
                     break
                 if self._save_is_due():
                     self.save()
@@ -151,9 +155,14 @@ class Trainer:
     @property
     def finished(self) -> bool:
         """Whether the budget of steps, with the updates that are due, or of time is spent."""
-        if out_of_time(vars(self.config.run), self.progress.wall_seconds):
+        out = out_of_time(vars(self.config.run), self.progress.wall_seconds)
+        if out or self._reached:
             return True
         return self.progress.step >= self.budget and not self.loop.has_due_updates
+
+    @property
+    def _reached(self) -> bool:
+        return is_reached(vars(self.config.run), self.progress.best)
 
     def stop(self) -> None:
         """Ask for the end after the running tick; may be called from a signal handler."""

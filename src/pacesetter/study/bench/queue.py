@@ -60,7 +60,7 @@ def is_finished(job: Job) -> bool:
         progress = Progress.load(table["progress"])
     except (UsageError, *storage.FAULTS):
         return False  # nothing yet, or damaged, which `resume` deals with
-    spent = is_spent(vars(job.config.run), progress.step, progress.wall_seconds)
+    spent = is_spent(vars(job.config.run), progress.step, progress.wall_seconds, progress.best)
     return spent and progress.last_evaluation == progress.step
 
 

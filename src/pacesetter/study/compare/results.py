@@ -87,7 +87,8 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        return is_spent(self.settings, self.clock[-1], self.wall[-1])
+        best = float(self.returns[self.steps > 0].max(initial=-np.inf))
+        return is_spent(self.settings, self.clock[-1], self.wall[-1], best)
 
     def cut(self, budget: int) -> "Run":
         """The run as it was at a budget."""

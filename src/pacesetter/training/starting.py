@@ -1,0 +1,65 @@
+"""The networks of an earlier run, or the actor of a policy file, as the start of a new run."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pacesetter import policy, storage
+from pacesetter.config import Config
+from pacesetter.ensemble.loop import Loop
+from pacesetter.errors import UsageError
+from pacesetter.learner.tree_arrays import below, rebuild
+from pacesetter.runs import find
+
+
+def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
+    """Give every member what `--start-from` names; the replay, the counters and noise start anew.
+
+    A run gives the whole state of its champion, optimiser state included, and the statistics that
+    normalize observations. A policy file gives the actor alone. Raises UsageError if it does not
+    fit this run.
+    """
+    source = str(config.run.start_from)
+    try:
+        if Path(source).suffix == ".safetensors":
+            _from_policy(loop, Path(source))
+        else:
+            _from_run(loop, config, source, runs)
+    except storage.FAULTS as error:
+        raise UsageError(f"start_from: {source} does not fit this run: {error}") from None
+
+
+def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None:
+    directory = find(source, runs)
+    arrays, table = storage.read(directory.state_file, "checkpoint")
+    old = {**directory.settings(), **table["run"]}
+    new = config.settings()
+    for name in ("algorithm", "normalize_observation"):
+        if old[name] != new[name]:
+            raise UsageError(
+                f"start_from: {directory.path} has {name}={old[name]}, this run {new[name]}"
+            )
+    champion = int(table["progress"]["champion"])
+    found = below(f"states.{champion}", arrays)
+    loop.learners.replace([_copied(state, found) for state in loop.learners.states])
+    loop.parts()["normalizer"].restore({}, below("normalizer", arrays))
+
+
+def _from_policy(loop: Loop, file: Path) -> None:
+    found = policy.load(file)
+    if len(found.actors) > 1:
+        raise UsageError(f"start_from: {file} averages {len(found.actors)} actors; name its run")
+    if found.normalizer is not None:
+        raise UsageError(
+            f"start_from: {file} acts on normalized observations, whose statistics a run keeps; "
+            "name its run"
+        )
+    learner, states = loop.learners.compiled.learner, loop.learners.states
+    loop.learners.replace([learner.with_actor(state, found.actors[0]) for state in states])
+
+
+def _copied(like: Any, arrays: storage.Arrays) -> Any:
+    """A state of its own, since an update uses it up."""
+    return jax.tree.map(jnp.array, rebuild(like, arrays))

@@ -1,0 +1,157 @@
+"""Runs that start from earlier weights, stop at a return, and keep policies of the past."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from short_runs import TINY, assert_same, log, run_to_end
+from stopping import stop_at
+
+from pacesetter import policy
+from pacesetter.errors import UsageError
+from pacesetter.runs import RunDirectory
+from pacesetter.study.bench.queue import Job, is_finished
+from pacesetter.study.compare.results import gather
+from pacesetter.training.trainer import Trainer
+
+ENV = "Pendulum-v1"
+SHORT: dict[str, Any] = {**TINY, "steps": 250, "eval_every": 250}
+
+
+def trained(runs: Path, algorithm: str = "td3", env: str = ENV, **settings: Any) -> Trainer:
+    trainer = Trainer(algorithm, env, runs=runs, **{**SHORT, **settings})
+    run_to_end(trainer)
+    return trainer
+
+
+def same(a: Any, b: Any) -> bool:
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, a, b)))
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "crossq-small", "sunrise", "trpo"])
+def test_every_member_starts_with_the_champion_of_a_run(runs: Path, algorithm: str) -> None:
+    """The whole state and the statistics of observations, of any algorithm."""
+    small = {"hidden": (8,)} if algorithm == "sunrise" else {}
+    tiny = {**SHORT, **small, "normalize_observation": True}
+    if algorithm == "trpo":
+        tiny = {"steps": 64, "parallel_envs": 2, "rollout_length": 32, "eval_every": 64,
+                "eval_episodes": 1}  # fmt: skip
+    if algorithm == "crossq-small":
+        del tiny["hidden"]
+    old = Trainer(algorithm, ENV, runs=runs, **tiny)
+    run_to_end(old)
+    members = {} if algorithm == "trpo" else {"members": 2}
+    new = Trainer(
+        algorithm, ENV, runs=runs, name="new", start_from=str(old.directory.path),
+        **{**tiny, **members},
+    )  # fmt: skip
+    champion = old.loop.learners.states[old.progress.champion]
+    assert all(same(champion, state) for state in new.loop.learners.states)
+    assert same(old.loop.parts()["normalizer"].arrays(), new.loop.parts()["normalizer"].arrays())
+    assert new.progress.step == 0
+    run_to_end(new)
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "sac", "ddpg"])
+def test_a_policy_file_gives_the_actor(runs: Path, algorithm: str) -> None:
+    """The new run acts as the file does, before it has learned anything."""
+    old = trained(runs, algorithm)
+    file = old.directory.policy_file
+    new = Trainer(algorithm, ENV, runs=runs, name="new", start_from=str(file), **SHORT)
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    assert np.array_equal(new.policy()(observations), policy.load(file)(observations))
+    run_to_end(new)
+
+
+def test_a_run_does_not_need_its_source_again(runs: Path) -> None:
+    """Resumed without it, the run equals one that was never stopped."""
+    old = trained(runs).directory.path
+    for name in ("whole", "cut"):
+        new = Trainer("td3", ENV, runs=runs / name, start_from=str(old), name="new", **SHORT)
+        if name == "whole":
+            whole = run_to_end(new)
+        else:
+            stop_at(new, 150)
+    shutil.rmtree(old)
+    assert_same(whole, run_to_end(Trainer.resume(new.directory.path)))
+
+
+def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: Path) -> None:
+    old = trained(runs)
+    file, run = old.directory.policy_file, old.directory.path
+    scaled = trained(runs, name="scaled", normalize_observation=True).directory.policy_file
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(file.read_bytes()[:-7])
+    for source, changes, words in [
+        (run, {"hidden": (8, 8)}, "does not fit this run: actor.0.bias is"),
+        (run, {"algorithm": "sac"}, "has algorithm=td3, this run sac"),
+        (run, {"env": "Hopper-v5"}, "does not fit this run"),
+        (run, {"normalize_observation": True}, "has normalize_observation=False, this run True"),
+        (file, {"hidden": (8, 8)}, "does not fit this run: its layers have shapes"),
+        (file, {"algorithm": "crossq-small"}, "CrossQ cannot take the actor of a policy file"),
+        (file, {"algorithm": "td7-small"}, "TD7 cannot take the actor of a policy file"),
+        (scaled, {}, "acts on normalized observations"),
+        (damaged, {}, "damaged"),
+        (tmp_path / "none.safetensors", {}, "none.safetensors"),
+        ("nowhere", {}, "'nowhere' not found"),
+    ]:
+        settings = {**SHORT, **changes}
+        algorithm, env = settings.pop("algorithm", "td3"), settings.pop("env", ENV)
+        if algorithm in ("crossq-small", "td7-small"):
+            del settings["hidden"]
+        with pytest.raises(UsageError, match=words):
+            Trainer(algorithm, env, runs=runs, name="new", start_from=str(source), **settings)
+        assert not list(runs.glob("*/new"))
+
+
+# Stop at a return.
+
+
+def test_a_run_stops_at_the_evaluation_that_reaches_the_return(runs: Path) -> None:
+    whole = trained(runs, name="whole", steps=1000, eval_every=100)
+    means = [row["mean"] for row in log(whole.directory) if row["kind"] == "eval"][1:]
+    goal = sorted(means)[len(means) // 2]
+    first = next(i for i, mean in enumerate(means) if mean >= goal)
+    short = trained(runs, name="short", steps=1000, eval_every=100, stop_at=goal)
+    rows = [row for row in log(short.directory) if row["kind"] == "eval"]
+    assert short.finished
+    assert short.progress.step == rows[-1]["step"] == (first + 1) * 100
+    assert [row["mean"] for row in rows[1:]] == means[: first + 1]
+    assert is_finished(Job(short.config, short.directory, []))
+    (seen,), _ = gather([short.directory.path])
+    assert seen.finished
+
+
+def test_it_goes_on_with_a_higher_return(runs: Path) -> None:
+    short = trained(runs, steps=400, eval_every=100, stop_at=-1e9)
+    assert short.progress.step == 100
+    more = Trainer.resume(short.directory.path, stop_at=1e9)
+    run_to_end(more)
+    assert more.progress.step == 400
+    assert more.directory.config().run.stop_at == 1e9
+
+
+# Keep policies of the past.
+
+
+def test_the_last_policies_are_kept(runs: Path) -> None:
+    run = trained(runs, steps=500, eval_every=100, keep=3).directory
+    files = sorted((run.path / "policies").iterdir())
+    assert [file.name for file in files] == [f"step-{step}.safetensors" for step in (300, 400, 500)]
+    assert [policy.load(file).about["step"] for file in files] == [300, 400, 500]
+    assert files[-1].read_bytes() == run.policy_file.read_bytes()
+
+
+def test_none_are_kept_by_default(runs: Path) -> None:
+    assert not (trained(runs).directory.path / "policies").exists()
+
+
+def test_steps_are_sorted_as_numbers(runs: Path) -> None:
+    """90, 100, 110: as words 110 would come before 90."""
+    run: RunDirectory = trained(runs, steps=110, warmup=10, eval_every=10, keep=3).directory
+    assert {file.stem for file in (run.path / "policies").iterdir()} == {
+        "step-90", "step-100", "step-110"
+    }  # fmt: skip
