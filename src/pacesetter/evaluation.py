@@ -28,6 +28,10 @@ class Evaluation:
     std: float
     terms: dict[str, float]
 
+    def __repr__(self) -> str:
+        count = len(self.returns)
+        return f"Evaluation(mean {self.mean:.1f}, std {self.std:.1f}, {count} returns)"
+
     def table(self) -> dict[str, Any]:
         """As plain JSON."""
         return asdict(self)

@@ -68,6 +68,18 @@ def test_a_run_of_hours_is_not() -> None:
     assert Clockwork("crossq", 2.0, time="8h").lines(200) == []
 
 
+def test_settings_too_slow_for_the_machine_are_said_however_short_the_run() -> None:
+    """Default crossq on two busy cores made 171 updates in 9 minutes, and nothing was said."""
+    (line,) = Clockwork("crossq", 171 / 540, steps=7_000).lines(200)
+    assert "0.32 updates per second" in line
+    assert "about 1.7 hours" in line, "2,000 steps are left, one update each"
+    assert "train crossq-small instead" in line
+    (line,) = Clockwork("crossq", 0.5, steps=5_500).lines(200)
+    assert "about 17 minutes" in line
+    assert Clockwork("crossq", 0.5, steps=5_200).lines(200) == [], "seven minutes are borne"
+    assert Clockwork("crossq", 6.0, steps=20_000).lines(200) == [], "42 minutes of a usual speed"
+
+
 def test_the_view_names_the_phase() -> None:
     trainer: Any = Clockwork("td3", 1.0, steps=30_000)
     trainer.progress = SimpleNamespace(

@@ -1,6 +1,5 @@
 """What a person should know of a run's settings before hours are spent on it."""
 
-from datetime import timedelta
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,8 @@ if TYPE_CHECKING:
 
 SAMPLE = 20.0  # seconds of updates that an estimate rests on
 LONG = 24 * 3600.0  # seconds from which a run's length is worth a line
+SLOW = 5.0  # updates per second below which a run is worth a line before a day is
+SOON = 10 * 60.0  # seconds that nobody minds, however slow the updates are
 WIDE = 256  # units of a layer that a CPU updates quickly
 
 
@@ -29,7 +30,11 @@ def within_warmup(config: "Config") -> str | None:
 
 
 class Slowness:
-    """Says once that a run would take more than a day, by the speed of its first updates."""
+    """Says once how long a run will take, by the speed of its first updates.
+
+    Only where this is more than a day, or where updates are so slow that the settings do not suit
+    the machine: then another choice would save most of the time, however short the run is.
+    """
 
     def __init__(self, trainer: "Trainer") -> None:
         self._trainer = trainer
@@ -50,9 +55,10 @@ class Slowness:
         if seconds < SAMPLE:
             return None
         self._over = True
-        left = self._left() * seconds / made
-        limit = self._trainer.config.run.time or inf
-        return self._line(made / seconds, left) if min(left, limit) > LONG else None
+        speed = made / seconds
+        left, limit = self._left() / speed, self._trainer.config.run.time
+        bearable = SOON if speed < SLOW and limit is None else LONG
+        return self._line(speed, left) if min(left, limit or inf) > bearable else None
 
     def _left(self) -> float:
         """Critic updates that the budget still asks for."""
@@ -61,11 +67,18 @@ class Slowness:
         return steps * hyper.updates_per_step
 
     def _line(self, speed: float, seconds: float) -> str:
-        days = timedelta(seconds=seconds) / timedelta(days=1)
         return (
-            f"at {speed:.2g} updates per second this run takes about {days:,.1f} days on this "
+            f"at {speed:.2g} updates per second this run takes about {_long(seconds)} on this "
             f"machine; {_remedy(self._trainer.config)}; Ctrl-C saves"
         )
+
+
+def _long(seconds: float) -> str:
+    """A length of time in its largest unit."""
+    for unit, size in (("days", 86_400.0), ("hours", 3_600.0)):
+        if seconds > size:
+            return f"{seconds / size:,.1f} {unit}"
+    return f"{seconds / 60:.0f} minutes"
 
 
 def _remedy(config: "Config") -> str:

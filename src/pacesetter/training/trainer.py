@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
 from pacesetter.config import resolve
 from pacesetter.ensemble.loop import Loop
@@ -24,9 +24,34 @@ from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
 from pacesetter.training.starting import start_from
 
+if TYPE_CHECKING:
+    from pacesetter.settings.typed import Name, RunSettings
+
 
 class Trainer:
     """A run, new or resumed: iterate over it to train, break to stop; it goes on with `resume`."""
+
+    @overload
+    def __init__(
+        self,
+        algorithm: "Name",
+        env: str,
+        *,
+        runs: str | Path = "runs",
+        config: str | Path | None = None,
+        **settings: "Unpack[RunSettings]",
+    ) -> None: ...
+
+    @overload  # presets and algorithms of other people
+    def __init__(
+        self,
+        algorithm: str,
+        env: str,
+        *,
+        runs: str | Path = "runs",
+        config: str | Path | None = None,
+        **settings: Any,
+    ) -> None: ...
 
     def __init__(
         self,
@@ -98,6 +123,11 @@ class Trainer:
             self.directory.unlock()
             raise
         return self
+
+    def __repr__(self) -> str:
+        run = self.config.run
+        done = f"{self.progress.step:,} of {self.budget:,} steps"
+        return f"Trainer({run.name} on {run.env}, seed {run.seed}: {done}, {self.directory.path})"
 
     def _begin(self) -> None:
         run, hyper = self.config

@@ -90,6 +90,12 @@ class Comparison:
         """Runs of the group that has the fewest."""
         return min(len(group.runs) for group in self.groups)
 
+    def __repr__(self) -> str:
+        from pacesetter.study.report.contents import title
+
+        count = f"{len(self.runs)} run{'s' if len(self.runs) > 1 else ''}"
+        return f"Comparison({title(self)}: {count}, {self.metric})"
+
     def _repr_html_(self) -> str:
         """The table of the metric, for notebooks."""
         from pacesetter.study.report.output import notebook

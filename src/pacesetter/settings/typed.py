@@ -1,0 +1,237 @@
+"""Settings of a run as an editor sees them: written by scripts/typed_settings.py."""
+
+from collections.abc import Sequence
+from typing import Any, Literal, TypedDict
+
+# fmt: off
+Name = Literal[
+    "td3", "td7", "sac", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3", "ddpg", "trpo",
+    "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-crossq", "multi-sunrise",
+    "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg", "td3-paper",
+    "ddpg-original", "crossq-small", "crossq-lean", "crossq-wn", "td7-small", "sunrise-official",
+    "demo", "steve-paper", "me-trpo-paper"
+]
+# fmt: on
+
+
+class RunSettings(TypedDict, total=False):
+    """What `Trainer` takes besides algorithm and env, whichever algorithm has it."""
+
+    env_kwargs: dict[str, Any]
+    """keywords for gymnasium.make"""
+    name: str
+    """name of the run's folder, below its env"""
+    steps: int | str
+    """budget of env steps, all members together"""
+    time: float | str | None
+    """stop after this wall time, such as 2h; default no limit"""
+    seed: int
+    """seed of every random stream"""
+    members: int
+    """ensemble members: learners that share the replay"""
+    rule: str
+    """selection rule: who is copied to whom; see `pacesetter list rules`"""
+    select_on: Literal["train", "eval"]
+    """select by returns of training episodes, or of extra noise-free ones"""
+    select_every: int | str
+    """env steps between selections, with --select-on eval"""
+    select_window: int | None
+    """episodes per member behind each selection; default 1, with --rule rescue 5"""
+    select_after: int | str | None
+    """env steps before the first selection; default --warmup"""
+    count_selection_steps: bool
+    """count the steps of extra selection episodes towards --steps"""
+    copy: Literal["full", "weights", "actor"]
+    """copy networks and optimiser state, only networks, or only the actor"""
+    same_init: bool
+    """start all members from the same weights"""
+    count: Literal["all", "member"]
+    """count --steps and intervals over all members, or per member"""
+    wait: bool
+    """a member whose episode has ended waits until all have ended"""
+    replay_scope: Literal["shared", "member"]
+    """one shared replay, or one per member"""
+    mean_actions: Literal["auto", "on", "off"]
+    """also evaluate the mean action of all members and that of their EMA actors; auto: of..."""
+    ema_tau: float
+    """step of the EMA actors per actor update"""
+    snapshots: int
+    """last evaluated champions whose mean action is evaluated too; 0 evaluates none"""
+    eval_every: int | str
+    """env steps between evaluations"""
+    eval_episodes: int
+    """episodes per evaluation"""
+    checkpoint_every: float | str
+    """time between checkpoints, such as 5m"""
+    device: Literal["auto", "cpu", "gpu", "tpu"]
+    """device that runs the updates"""
+    gamma: float
+    """discount factor per env step"""
+    normalize_observation: bool
+    """normalize observations by running mean and standard deviation, clip at 10"""
+    batch_size: int
+    """transitions per minibatch"""
+    replay_size: int | str
+    """transitions kept; the oldest are overwritten first"""
+    replay: Literal["uniform", "prioritized", "lap", "return"]
+    """sample transitions uniformly, by TD error (PER or LAP) or by episode return"""
+    replay_exponent: float | None
+    """priority exponent alpha; 0 samples uniformly; default 0.6, or 0.4 for lap"""
+    replay_importance: float | None
+    """initial importance exponent beta, annealed to 1; 0 disables weights; default 0.4, or 0..."""
+    replay_horizon: int | str | None
+    """env steps until beta is 1; default --steps"""
+    replay_to_go: bool
+    """rank transitions by return to go instead of the whole episode's return"""
+    n_step: int
+    """rewards summed in an n-step target"""
+    assess: int
+    """episodes that assess a policy before its next updates, as in TD7 (20 there); 0..."""
+    assess_after: int | str | None
+    """updates of a member before assessments take several episodes; default 750000"""
+    warmup: int | str
+    """env steps of uniformly random actions at the start, all members"""
+    warmup_updates: bool
+    """also update during the warm-up"""
+    updates_per_step: float
+    """critic updates per env step of the member"""
+    num_envs: int
+    """envs per member, stepped in turn"""
+    update_at: Literal["step", "episode"]
+    """update after each step, or make all due updates when the episode ends"""
+    update_every: int | str | None
+    """env steps of a member between blocks of updates; default 1"""
+    lr_end: float
+    """share of every learning rate that is left at the end; it falls linearly"""
+    lr_horizon: int | str | None
+    """env steps until that share is reached; default --steps"""
+    precision: Literal["f32", "bf16"]
+    """precision of large matrix products; accumulation is always float32"""
+    hidden: Sequence[int]
+    """widths of the hidden layers"""
+    actor_learning_rate: float
+    """Adam learning rate of the actor"""
+    critic_learning_rate: float
+    """Adam learning rate of the critics"""
+    tau: float
+    """step size of the soft target update"""
+    critics: int
+    """critics; the target uses their minimum"""
+    critic_layer_norm: bool
+    """use layer norm before each ReLU of the critics"""
+    actor_layer_norm: bool
+    """use layer norm before each ReLU of the actor"""
+    quantiles: int
+    """quantiles that each critic learns, usually 25; 0 learns only the mean"""
+    policy_delay: int
+    """critic updates per actor update"""
+    target_noise: float
+    """standard deviation of the target action's noise"""
+    target_noise_clip: float
+    """bound of the target action's noise"""
+    exploration: str
+    """noise on actions, or on the actor's weights"""
+    exploration_noise: float
+    """standard deviation of that noise, measured on actions"""
+    encoder_hidden: Sequence[int]
+    """widths of the two hidden layers of each encoder"""
+    encoder_size: int
+    """numbers in an embedding"""
+    encoder_learning_rate: float
+    """Adam step size of the encoders"""
+    copy_every: int
+    """critic updates between copies to the targets"""
+    alpha_learning_rate: float
+    """Adam step size of the log temperature"""
+    initial_alpha: float
+    """temperature at the start"""
+    target_entropy: float | None
+    """in nats; default minus the action size"""
+    critic_hidden: Sequence[int]
+    """widths of the critics' hidden layers"""
+    adam_momentum: float
+    """Adam's first decay for actor and critics"""
+    renorm_after: int | str
+    """a network's updates with plain batch norm before renorm"""
+    weight_norm: bool
+    """keep the weights into every hidden unit at length 1"""
+    next_batch_gradient: bool
+    """gradient through (s', a') where they shape a batch's mean and variance"""
+    ensemble: int
+    """learners in one state (N)"""
+    mask_probability: float
+    """chance that a learner trains on a transition (beta)"""
+    backup_temperature: float
+    """temperature T of the weighted Bellman backup; 0 weights all alike"""
+    ucb: float
+    """standard deviations added to an action's value (lambda)"""
+    reference: Literal["paper", "official"]
+    """formulas as published, or as in the authors' code"""
+    action_layer: int
+    """critic layer that the action joins"""
+    critic_decay: float
+    """L2 decay added to the critic's gradient"""
+    output_bound: float | None
+    """bound of initial output weights; default 1/sqrt(inputs)"""
+    horizon: int
+    """rollout horizon H in the models; 0 uses no model"""
+    critic_members: int
+    """critics whose disagreement weights the target; each learns on its own rows"""
+    models: int
+    """models, and reward heads; each learns on its own rows"""
+    model_hidden: Sequence[int]
+    """widths of a model's hidden layers"""
+    head_hidden: Sequence[int]
+    """widths in the heads for reward and termination"""
+    model_learning_rate: float
+    """Adam step size of the models"""
+    model_decay: float
+    """L2 decay added to the models' gradient"""
+    parallel_envs: int
+    """envs per rollout, stepped in turn"""
+    rollout_length: int | str
+    """steps of each env per rollout"""
+    initial_std: float
+    """deviation of actions at the start"""
+    gae_lambda: float
+    """decay of later errors in advantages"""
+    max_kl: float
+    """bound of the mean KL of one update, in nats"""
+    damping: float
+    """added to the Fisher matrix's diagonal"""
+    gradient_steps: int
+    """conjugate gradient steps an update"""
+    backtracks: int
+    """lengths that the line search tries"""
+    backtrack_ratio: float
+    """each length by the one before"""
+    critic_epochs: int
+    """passes of the critic over a rollout"""
+    critic_batch_size: int
+    """observations in its minibatches"""
+    starts: int
+    """resets per update that start imagined episodes; not counted as env steps"""
+    known: bool
+    """use the walker's known reward and termination instead of learning them"""
+    model_noise: bool
+    """models learn a deviation too, of which imagined steps draw"""
+    model_batch_size: int
+    """rows in a model's minibatch"""
+    model_patience: int
+    """passes without a fall that end a fit"""
+    model_rows: int | str
+    """rows that a fit goes through at most"""
+    renew_every: int
+    """iterations from new networks to new; 0: never"""
+    imagined_steps: int | str
+    """imagined steps of a policy update"""
+    bootstrap: bool
+    """the critic's value counts at the horizon"""
+    policy_updates: int
+    """policy updates of an iteration at most"""
+    check_every: int
+    """policy updates between checks in all models"""
+    patience: int
+    """policy updates without a kept policy that end it"""
+    share: float
+    """share of models that must not see a fall"""
