@@ -27,7 +27,7 @@ def content(directory: RunDirectory) -> dict[str, Any]:
     """All that a finished run holds, clocks apart: arrays, counters, streams, replay rows, log."""
     arrays, table = storage.read(directory.state_file, "checkpoint")
     table["progress"] = {k: v for k, v in table["progress"].items() if k not in CLOCKS}
-    del table["log"]
+    del table["log"], table["log_hash"]
     return {"arrays": arrays, "table": table, "log": log(directory)}
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -41,13 +42,27 @@ class Log:
         with open(self.path, "a", encoding="utf-8", opener=regular) as file:
             file.write(as_json(row) + "\n")
 
-    def sync(self) -> int:
-        """Flush it to disk; returns its size in bytes."""
-        if not present(self.path):
-            return 0
-        with open(self.path, "ab", opener=regular) as file:
-            os.fsync(file.fileno())
-            return file.tell()
+    def seal(self) -> tuple[int, str]:
+        """Flush it to disk; returns its size in bytes and their SHA-256."""
+        if present(self.path):
+            with open(self.path, "ab", opener=regular) as file:
+                os.fsync(file.fileno())
+        data = self.read()
+        return len(data), sha256(data).hexdigest()
+
+    def refuse_other(self, size: int, digest: str | None) -> None:
+        """Refuse a log that does not begin with the bytes that were sealed.
+
+        Less of it is no other log, as long as its rows can be read. Old seals have no digest.
+        """
+        data = self.read()
+        if len(data) < size:
+            self.rows()
+        elif digest is not None and sha256(data[:size]).hexdigest() != digest:
+            raise UsageError(
+                f"{self.path}: its first {size:,} bytes are not those that the checkpoint covers; "
+                "put them back, or remove the file to go on without its rows"
+            )
 
     def cut(self, size: int) -> bool:
         """Truncate it to the whole lines that a checkpoint covers; False if rows are missing."""

@@ -1,5 +1,6 @@
 """A whole run to a file and back, bit for bit; each part of the loop saves and restores itself."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ from pacesetter.learner.tree_arrays import below
 from pacesetter.process import threads
 from pacesetter.replay.buffer import Replay
 from pacesetter.runs import RunDirectory
+from pacesetter.settings import Settings
 from pacesetter.storage import Content
 from pacesetter.types import Arrays
 
 KIND = "checkpoint"
 SCHEMA = 4
+# What a run is given anew by flags of `resume`, or what changes no result of it.
+FREE_ON_RESUME = {"steps", "time", "name", "checkpoint_every", "device"}
 LATER = ("averages",)  # parts that the first checkpoints of this schema have not
 
 
@@ -34,15 +38,39 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
         if not isinstance(part, Replay):  # whose scores are NaN until an episode ends
             _refuse_faults(found, loop.progress.step)
         arrays |= found
+    size, log_hash = directory.log.seal()
     table = {
         "schema": SCHEMA,
         "threads": threads(),
         "products": products.of(config.hyper),
         "run": _identity(config),
         **{name: part.table() for name, part in loop.parts().items()},
-        "log": directory.log.sync(),
+        "settings": _fixed(config),
+        "log": size,
+        "log_hash": log_hash,
     }
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
+
+
+def refuse_other_settings(config: Config, directory: RunDirectory) -> None:
+    """Refuse to go on with settings that the newest checkpoint was not made with.
+
+    Old checkpoints do not tell; a setting that is newer than the checkpoint is no difference.
+    """
+    for file in (directory.state_file, directory.previous_file):
+        try:
+            made_with: dict[str, Any] = storage.read(file, KIND).table.get("settings", {})
+        except UsageError:  # which `restore` will tell
+            continue
+        now = _fixed(config)
+        found = [key for key in now if key in made_with and now[key] != made_with[key]]
+        if found:
+            differences = ", ".join(f"{key}={now[key]}, not {made_with[key]}" for key in found)
+            raise UsageError(
+                f"{directory.config_file}: has {differences} as in its checkpoint; put that back, "
+                "or train under another --name"
+            )
+        return
 
 
 def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
@@ -75,6 +103,8 @@ def _restore(
     arrays, table = storage.read(file, KIND)
     _refuse_strangers(file, table, config)
     try:
+        size = int(table["log"])
+        _refuse_other_log(directory, size, table.get("log_hash"))
         for name, part in loop.parts().items():
             if name in LATER and name not in table:
                 notes.append(f"{name}: the checkpoint has none yet; they begin now")
@@ -83,7 +113,7 @@ def _restore(
                 notes.append(f"{name.replace('.', ' ')}: {note}")
     except storage.FAULTS as error:
         raise UsageError(f"{file}: does not fit this run: {error}") from None
-    if not directory.log.cut(int(table["log"])):
+    if not directory.log.cut(size):
         notes.append(f"{directory.metrics_file}: rows of the log are missing")
     if table["threads"] != threads() and loop.progress.step < loop.budget:
         notes.append(
@@ -112,9 +142,23 @@ def _refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None
         raise UsageError(f"{file}: is of another run: {table.get('run')}")
 
 
+def _refuse_other_log(directory: RunDirectory, size: int, log_hash: str | None) -> None:
+    try:
+        directory.log.refuse_other(size, log_hash)
+    except UsageError as error:
+        raise _Refused(str(error)) from None
+
+
 def _identity(config: Config) -> dict[str, Any]:
     names = ("algorithm", "env", "env_kwargs", "seed", "members")
     return {name: getattr(config.run, name) for name in names}
+
+
+def _fixed(config: Config) -> Settings:
+    """The settings that a run keeps, as JSON gives them back."""
+    return json.loads(
+        json.dumps({k: v for k, v in config.settings().items() if k not in FREE_ON_RESUME})
+    )
 
 
 def _refuse_faults(arrays: Arrays, step: int) -> None:

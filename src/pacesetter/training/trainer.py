@@ -106,6 +106,7 @@ class Trainer:
         if changed:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
+        checkpoint.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
         self._begin()
         self.directory.lock()
