@@ -56,8 +56,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_log(self) -> None:
         """`--log`, for verbs that train."""
-        tools = f"{', '.join(SINKS)} or {NONE}; several with commas"
-        about = f"send the log to these trackers too ({tools}; default those of the run, if any)"
+        tools = f"{', '.join(SINKS)} or {NONE}; default those that the run has"
+        about = f"also send the log to these trackers, separated by commas ({tools})"
         self.add_argument("--log", metavar="TOOLS", help=about)
 
     def add_env_keywords(self) -> None:
