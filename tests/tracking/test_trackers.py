@@ -205,12 +205,15 @@ def test_a_tracker_that_cannot_be_opened_stops_the_run(
     assert main(["resume", str(path), "--log", "none", "-q"]) == 0
 
 
+FOREIGN = {"id": "../../../x", "trackers": ["list"], "known": []}
+
+
 def test_a_damaged_record_is_one_line(
     runs: Path, capsys: pytest.CaptureFixture[str], listening: list[Row]
 ) -> None:
     assert train(runs) == 0
     path = runs / "probe_envs-Scripted-v0" / "td3" / "0"
-    for text in ("{", "[]", json.dumps({"id": 1})):
+    for text in ("{", "[]", json.dumps({"id": 1}), json.dumps(FOREIGN)):
         (path / "trackers.json").write_text(text)
         capsys.readouterr()
         assert main(["resume", str(path), "--steps", "300", "-q"]) == 2

@@ -67,7 +67,14 @@ def _parser(name: str | None) -> Parser:
     add, absent = command.add_argument, argparse.SUPPRESS
     add("--algos", nargs="+", metavar="ALGO", help="algorithms to run, or entries of the suite")
     add("--envs", nargs="+", metavar="ENV", default=absent, help="tasks, for all entries")
-    add("--seeds", nargs="+", type=int, metavar="N", default=absent, help="number of seeds, or the seeds themselves")
+    add(
+        "--seeds",
+        nargs="+",
+        type=int,
+        metavar="N",
+        default=absent,
+        help="number of seeds, or the seeds themselves",
+    )
     jobs = "runs at once (default one per core, pinned to it)"
     add("--jobs", type=int, metavar="N", help=jobs)
     executor = "run here or on a Ray cluster (default local)"

@@ -30,7 +30,8 @@ def tune(words: list[str]) -> int:
 def _parse(words: list[str]) -> tuple[str, str, Settings, dict[str, Any]]:
     """Algorithm, env, the settings that are fixed, and the flags of `tune` itself."""
     command = parser(
-        "tune", "Search settings. Run it again to continue, or several times at once to share the work."
+        "tune",
+        "Search settings. Run it again to continue, or several times at once to share the work.",
     )
     _add_own_flags(command)
     algorithm, env, rest = algorithm_and_env(command, words)

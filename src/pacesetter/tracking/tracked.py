@@ -1,6 +1,7 @@
 """Give the rows of a run to trackers, beside its metrics.jsonl."""
 
 import json
+import re
 import sys
 import uuid
 from collections.abc import Generator, Sequence
@@ -115,10 +116,9 @@ def _record(directory: RunDirectory) -> dict[str, Any]:
         return {"id": uuid.uuid4().hex[:8], "trackers": [], "known": []}
     try:
         table = json.loads(file.read_text())
-        return {
-            "id": str(table["id"]),
-            "trackers": [*table["trackers"]],
-            "known": [*table["known"]],
-        }
+        if not re.fullmatch("[0-9a-f]{8}", table["id"]):  # it becomes a part of file names
+            raise ValueError(f"id {table['id']}")
+        lists = {key: [*map(str, table[key])] for key in ("trackers", "known")}
+        return {"id": table["id"]} | lists
     except (ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file}: damaged: {error}; remove it") from None
