@@ -32,9 +32,11 @@ def run(runs: Path) -> RunDirectory:
     run.metrics_file.unlink()
     for step in range(0, 500 * EVALUATIONS, 500):
         returns = [step - 10.0, step + 30.0]
-        run.append({"kind": "eval", "step": step, "returns": returns, "mean": step + 10.0} | LEDGER)
+        run.log.append(
+            {"kind": "eval", "step": step, "returns": returns, "mean": step + 10.0} | LEDGER
+        )
     ended = [[0, 100.0, 10], [0, 300.0, 10]]
-    run.append({"kind": "train", "step": 2_000, "episodes_ended": ended} | LEDGER)
+    run.log.append({"kind": "train", "step": 2_000, "episodes_ended": ended} | LEDGER)
     return run
 
 
@@ -82,10 +84,16 @@ def test_a_row_that_is_being_written_is_left_out(run: RunDirectory, port: int) -
     assert json.loads(get(port, "/curve.json")[1])["evaluations"][-1][0] == 3_000
 
 
+def test_a_return_that_is_no_number_is_left_out(run: RunDirectory) -> None:
+    """As of a task that pays an infinite reward."""
+    run.log.append(run.rows("eval")[0] | {"mean": None, "returns": [1.0, None]})
+    assert len(curve(run)["evaluations"]) == EVALUATIONS
+
+
 def test_a_long_run_is_thinned(run: RunDirectory) -> None:
     """Evenly, so that a browser can draw it."""
     ended = [[0, float(index), 10] for index in range(2 * MOST_EPISODES)]
-    run.append({"kind": "train", "step": 3_000, "episodes_ended": ended} | LEDGER)
+    run.log.append({"kind": "train", "step": 3_000, "episodes_ended": ended} | LEDGER)
     found = curve(run)["episodes"]
     assert MOST_EPISODES / 2 < len(found) <= MOST_EPISODES
     assert found[-1][2] > 1.9 * MOST_EPISODES
@@ -150,7 +158,7 @@ def test_the_page_draws_and_refreshes(run: RunDirectory, port: int, tmp_path: Pa
         assert browser.execute_script("return document.documentElement.scrollWidth") == 360
         paper = "return getComputedStyle(document.body).backgroundColor"
         assert browser.execute_script(paper) == "rgb(23, 25, 28)"
-        run.append(run.rows("eval")[-1] | {"step": 2_500, "mean": 1234.5})
+        run.log.append(run.rows("eval")[-1] | {"step": 2_500, "mean": 1234.5})
         wait_for(browser, "document.querySelectorAll('.point').length", EVALUATIONS + 1)
         assert browser.find_element("id", "last").text == "1,234.5"
         assert browser.get_log("browser") == []

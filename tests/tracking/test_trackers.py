@@ -41,7 +41,7 @@ def test_names_are_those_of_the_log() -> None:
         "train/episodes_ended/length": 6.0,
         "train/assessed/kept": 1.0,
     }
-    nothing = {"kind": "train", "step": 7, "episodes_ended": [], "critic_loss": None}
+    nothing = {"kind": "train", "step": 7, "episodes_ended": [], "critic_loss": None, "x": [None]}
     assert numbers(nothing) == {}
     selection = {"kind": "select", "step": 7, "returns": [[1.0, 3.0], [5.0]], "parents": [1, 1]}
     assert numbers(selection) == {
@@ -218,6 +218,18 @@ def test_a_damaged_record_is_one_line(
         capsys.readouterr()
         assert main(["resume", str(path), "--steps", "300", "-q"]) == 2
         assert "trackers.json: damaged" in capsys.readouterr().err
+
+
+def test_files_behind_a_link_are_left_alone(runs: Path, tmp_path: Path, capsys: Any) -> None:
+    pytest.importorskip("tensorboardX")
+    assert train(runs) == 0
+    run = runs / "probe_envs-Scripted-v0" / "td3" / "0"
+    other = tmp_path / "events.out.tfevents.1"
+    other.touch()
+    (run / "tensorboard").symlink_to(tmp_path)
+    assert main(["resume", str(run), "--steps", "300", "--log", "tensorboard", "-q"]) == 2
+    assert "is a link" in capsys.readouterr().err
+    assert other.exists()
 
 
 def test_bench_passes_it_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,7 +31,7 @@ def curve(run: RunDirectory) -> dict[str, Any]:
         "title": f"{settings['env']}, {settings['name']}, seed {settings['seed']}",
         "budget": budget(settings),
         "is_running": run.in_use(),
-        "evaluations": [_evaluation(row) for row in rows if row["kind"] == "eval"],
+        "evaluations": [_evaluation(row) for row in rows if row.get("mean") is not None],
         "episodes": _episodes(rows),
         "spent": [[row["step"], row["wall_seconds"]] for row in rows[-20:]],
         "updates": rows[-1]["updates"] if rows else 0,

@@ -1,6 +1,6 @@
 """A row of the log as named numbers, which is all that a tracker can plot."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from pacesetter.runs import Row
@@ -24,16 +24,19 @@ def numbers(row: Row) -> dict[str, float]:
 def _named(name: str, value: Any, columns: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     if columns:
         for column, entries in zip(columns, list(zip(*value, strict=True))[1:], strict=False):
-            yield f"{name}/{column}", _mean(entries)
+            yield from _mean(f"{name}/{column}", entries)
     elif isinstance(value, dict):
         for key, each in value.items():
             yield from _named(f"{name}/{key}", each, ())
     elif isinstance(value, list):
         for index, each in enumerate(value):
-            yield f"{name}/{index}", _mean(each) if isinstance(each, list) else float(each)
-    elif isinstance(value, (int, float)):
-        yield name, float(value)
+            yield from _mean(f"{name}/{index}", each if isinstance(each, list) else [each])
+    else:
+        yield from _mean(name, [value])
 
 
-def _mean(values: Any) -> float:
-    return float(sum(values) / len(values))
+def _mean(name: str, values: Iterable[Any]) -> Iterator[tuple[str, float]]:
+    """The mean of what is a number; NaN is null in the log, and a tracker gets no point of it."""
+    found = [float(value) for value in values if isinstance(value, (int, float))]
+    if found:
+        yield name, sum(found) / len(found)

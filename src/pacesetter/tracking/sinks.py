@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pacesetter.errors import UsageError
 from pacesetter.media.extras import need
 from pacesetter.runs import Row
 from pacesetter.tracking.numbers import numbers
@@ -44,6 +45,8 @@ def tensorboard(run: Tracked) -> Generator[Write]:
     """Event files in the run's folder, made anew from its log: so none holds a row twice."""
     writers = need("log", "tensorboardX", "pacesetter[tensorboard]")
     folder = run.folder / "tensorboard"
+    if folder.is_symlink():
+        raise UsageError(f"log: {folder} is a link, and what it leads to is not ours; remove it")
     for old in folder.glob("events.out.tfevents.*"):
         old.unlink()
     spent = run.rows[-1]["wall_seconds"] if run.rows else 0.0

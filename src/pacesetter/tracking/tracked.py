@@ -11,7 +11,7 @@ from typing import Any
 from pacesetter.errors import TrainingError, UsageError, unknown
 from pacesetter.media.extras import look_for
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.storage import write_atomically
+from pacesetter.storage import as_json, present, read_bytes, write_atomically
 from pacesetter.tracking.sinks import SINKS, Tracked, Write
 
 FILE = "trackers.json"
@@ -105,20 +105,20 @@ def _run(directory: RunDirectory, record: dict[str, Any], name: str) -> Tracked:
 def _note(directory: RunDirectory, record: dict[str, Any], **changes: Any) -> None:
     """Keep what a resumed run must know, where it is new."""
     if record | changes != record:
-        table = json.dumps(record | changes)
+        table = as_json(record | changes)
         write_atomically(directory.path / FILE, f"{table}\n".encode())
 
 
 def _record(directory: RunDirectory) -> dict[str, Any]:
     """The run's id in all trackers, those that it uses, and those that know it."""
     file = directory.path / FILE
-    if not file.exists():
+    if not present(file):
         return {"id": uuid.uuid4().hex[:8], "trackers": [], "known": []}
     try:
-        table = json.loads(file.read_text())
+        table = json.loads(read_bytes(file))
         if not re.fullmatch("[0-9a-f]{8}", table["id"]):  # it becomes a part of file names
             raise ValueError(f"id {table['id']}")
         lists = {key: [*map(str, table[key])] for key in ("trackers", "known")}
         return {"id": table["id"]} | lists
-    except (ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{file}: damaged: {error}; remove it") from None
