@@ -26,6 +26,8 @@ HERE = Path(__file__).parent
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
     "paper": [{"budget": "1M"}],
+    "paper-table-1": [{"budget": "50k", "reference": "sac"}],
+    "frontier": [{"budget": "100k", "reference": "td3-norm-128x2"}],
     "pilot": [
         {"budget": "100k"},
         {"budget": "100k", "reference": "multi-td3"},
