@@ -20,7 +20,7 @@ from pacesetter.config import resolve
 from pacesetter.dynamics.model import Dynamics, Known
 from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.errors import UsageError
-from pacesetter.policy import forward
+from pacesetter.networks.forward import forward
 from pacesetter.training.trainer import Trainer
 
 SMALL: dict[str, Any] = {"hidden": (12, 10), "model_hidden": (8,), "head_hidden": (6,)}

@@ -18,7 +18,8 @@ from pacesetter.config import resolve
 from pacesetter.ensemble import members
 from pacesetter.errors import UsageError
 from pacesetter.networks import mlp
-from pacesetter.policy import Policy, forward, load, unstack
+from pacesetter.networks.forward import forward
+from pacesetter.policy import Policy, load, unstack
 from pacesetter.training.trainer import Trainer
 
 BASES = {"sunrise": "sac", "sunrise-td3": "td3"}

@@ -13,7 +13,8 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter.algorithms.contract import Array, Learner, Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
-from pacesetter.policy import Actors, forward
+from pacesetter.networks.forward import forward
+from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
 from pacesetter.settings.values import Width
 from pacesetter.types import Floats

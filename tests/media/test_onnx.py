@@ -13,7 +13,8 @@ import pytest
 from pacesetter import load
 from pacesetter.errors import UsageError
 from pacesetter.media.export import export
-from pacesetter.policy import ACTIVATIONS, ENCODER, OUTPUTS, Policy
+from pacesetter.networks.forward import ACTIVATIONS, ENCODER, OUTPUTS
+from pacesetter.policy import Policy
 
 onnx = pytest.importorskip("onnx", reason="needs the extra onnx")
 onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")

@@ -33,7 +33,8 @@ from pacesetter.algorithms.contract import (
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
 from pacesetter.networks.critic_heads import min_q
-from pacesetter.policy import Actors, clip, forward
+from pacesetter.networks.forward import clip, forward
+from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, only
 from pacesetter.settings.values import Count
 from pacesetter.types import Floats

@@ -23,6 +23,7 @@ from pydantic.dataclasses import dataclass as settings
 from pacesetter.algorithms.contract import Array, Learner, Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
+from pacesetter.networks.forward import forward
 from pacesetter.networks.trust_region import (
     Distribution,
     Gaussian,
@@ -32,7 +33,7 @@ from pacesetter.networks.trust_region import (
     line_search,
     log_probability,
 )
-from pacesetter.policy import Actors, forward
+from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OnPolicy
 from pacesetter.settings.values import Width
 from pacesetter.types import Floats

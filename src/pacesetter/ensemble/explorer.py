@@ -9,7 +9,7 @@ from pacesetter.batch import Transition
 from pacesetter.envs import Environment, Snapshot
 from pacesetter.errors import TrainingError
 from pacesetter.learner.tree_arrays import flatten, rebuild
-from pacesetter.policy import clip
+from pacesetter.networks.forward import clip
 from pacesetter.seeding import Stream, generator
 from pacesetter.types import Arrays, Floats
 

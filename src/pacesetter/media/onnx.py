@@ -9,25 +9,21 @@ from numpy.typing import NDArray
 
 from pacesetter.errors import UsageError
 from pacesetter.media.extras import need
-from pacesetter.policy import (
+from pacesetter.networks.forward import (
     ACTIVATIONS,
     ENCODER,
     LENGTH_EPSILON,
     NORM_EPSILON,
-    OBSERVATION_LIMIT,
     OUTPUTS,
-    Floats,
-    Layers,
-    Policy,
     forward,
     has_encoder,
-    to_env,
 )
+from pacesetter.policy import OBSERVATION_LIMIT, Floats, Layers, Policy, to_env
 from pacesetter.storage import write_atomically
 
 INSTALL = "pacesetter[onnx]"
 OPSET, IR = 17, 8  # of 2022: runtimes from onnxruntime 1.12 on read them
-OPERATORS = {"relu": "Relu", "tanh": "Tanh"}  # of policy.ACTIVATIONS and, but for clip, OUTPUTS
+OPERATORS = {"relu": "Relu", "tanh": "Tanh"}  # of forward.ACTIVATIONS and, but for clip, OUTPUTS
 TOLERANCE = 1e-6  # of the action range
 Array = NDArray[Any]
 
@@ -135,7 +131,7 @@ def _actor(graph: Graph, policy: Policy, layers: Layers, x: str) -> str:
 
 
 def _embed(graph: Graph, x: str, layer: dict[str, Array]) -> str:
-    """What `policy.embed` does."""
+    """What `forward.embed` does."""
     encoded = x
     for kernel, bias in ENCODER[:-1]:
         encoded = _elu(graph, graph.node("Gemm", encoded, layer[kernel], layer[bias]))

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import AfterValidator, ValidationInfo
 
 from pacesetter.networks import mlp
-from pacesetter.policy import forward
+from pacesetter.networks.forward import forward
 from pacesetter.types import Floats, Layers
 
 OU_PULL = 0.15

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter.networks import mlp
-from pacesetter.policy import Actors, clip, forward
+from pacesetter.networks.forward import clip, forward
+from pacesetter.policy import Actors
 from pacesetter.types import Floats, Layers
 
 Array = jax.Array

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 from pacesetter.batch import Spec
 from pacesetter.networks import mlp
+from pacesetter.networks.forward import ENCODER, LENGTH_EPSILON
 from pacesetter.networks.mlp import Array, Network
-from pacesetter.policy import ENCODER, LENGTH_EPSILON
 
 
 class Encoder(NamedTuple):
