@@ -3,7 +3,7 @@
 import argparse
 import tomllib
 from collections.abc import Collection
-from typing import Any, Literal, NoReturn, get_args, get_origin
+from typing import Any, ClassVar, Literal, NoReturn, get_args, get_origin
 
 from pacesetter import consent
 from pacesetter.errors import UsageError, unknown
@@ -18,6 +18,20 @@ _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 class Parser(argparse.ArgumentParser):
     """An argparse parser with one-line errors, which names the flags nearest to an unknown one."""
+
+    kept: ClassVar[list["Parser"] | None] = None  # if a list, it gets parsers instead of their help
+
+    def print_help(self, file: Any = None) -> None:
+        if Parser.kept is None:
+            super().print_help(file)
+        else:
+            Parser.kept.append(self)
+
+    def mark(self, name: str, values: dict[str, Any]) -> None:
+        """Give the arguments that are named an attribute, for completion by a shell."""
+        for action in self._actions:
+            if action.dest in values:
+                setattr(action, name, values[action.dest])
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message[:1].lower()}{message[1:]}; see `{self.prog} --help`")

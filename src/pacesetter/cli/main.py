@@ -6,6 +6,7 @@ from signal import SIGINT
 
 from pacesetter.cli.bench import bench
 from pacesetter.cli.compare import compare
+from pacesetter.cli.completion import completion
 from pacesetter.cli.evaluate import evaluate
 from pacesetter.cli.listing import list_
 from pacesetter.cli.live import live
@@ -33,6 +34,7 @@ VERBS: dict[str, Callable[[list[str]], int]] = {
     "export": export,
     "push": push,
     "fetch": fetch,
+    "completion": completion,
 }
 
 
@@ -79,7 +81,7 @@ def _run(words: list[str]) -> int:
 
 
 def _overview() -> str:
-    lines = [f"  {verb:8} {(function.__doc__ or '').strip()}" for verb, function in VERBS.items()]
+    lines = [f"  {verb:10} {(function.__doc__ or '').strip()}" for verb, function in VERBS.items()]
     return "\n".join(
         [
             "usage: pacesetter VERB ...",
