@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
+from pacesetter.ensemble import varied
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settings, budget
 from pacesetter.settings.ensemble import Ensemble
@@ -91,6 +92,11 @@ class Config(NamedTuple):
         after = self.run.select_after
         return self.hyper.warmup if after is None else after
 
+    def annealed(self, step: int) -> float:
+        """How far a replay's importance exponent has gone from its start to 1, in [0, 1]."""
+        horizon = (self.hyper.replay_horizon or 0) * self.steps_per_count
+        return min(step / horizon, 1.0) if horizon else 1.0
+
     @property
     def lr_updates(self) -> float:
         """Critic updates of one member until its learning rates have fallen to `--lr-end`."""
@@ -147,6 +153,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     hyper = build(hyper_type, {key: value for key, value in merged.items() if key in hyper_names})
     if isinstance(hyper, OffPolicy):
         _refuse_conflicts(run, hyper)
+        varied.check(run, hyper)
         if hyper.exponents[1] and hyper.replay_horizon is None:
             hyper = replace(hyper, replay_horizon=run.steps)  # a later budget does not change it
         if hyper.lr_end != 1 and hyper.lr_horizon is None:
@@ -189,7 +196,7 @@ def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
 
 def _refuse_ensemble(run: Run) -> None:
     for name, info in fields_of(Ensemble).items():
-        value, default = getattr(run, name), info.default
+        value, default = getattr(run, name), info.get_default(call_default_factory=True)
         if value != default:
             raise UsageError(
                 f"{name}: {run.algorithm} trains one member, on its own rollouts; "

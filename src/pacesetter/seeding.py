@@ -17,6 +17,7 @@ class Stream(IntEnum):
     RULE = 6
     ACT = 7
     MASK = 8
+    VARY = 9  # no episodes, whose seeds have room for eight streams
 
 
 def generator(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

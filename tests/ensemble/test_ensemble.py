@@ -220,7 +220,7 @@ def test_average_is_the_mean_of_the_better_half(states: Any) -> None:
     the best, for everyone; `weights` and `actor` take their part of it and leave the rest.
     """
     states = [jax.tree.map(lambda x: x.round() if x.dtype.kind == "f" else x, s) for s in states]
-    parents, weights, _ = choose(
+    parents, weights, *_ = choose(
         "average", np.array([[4.0], [1.0], [6.0]]), np.random.default_rng()
     )
     assert parents.tolist() == [2, 2, 2]

@@ -127,7 +127,7 @@ def test_only_the_order_of_returns_counts(rule: str, returns: Any, shift: int, s
 def test_average_weights_the_better_half_alike(returns: Any) -> None:
     """Everyone's row: 1 / half for the half that `top_half` keeps, else 0; the best is parent."""
     count, half = len(returns), -(-len(returns) // 2)
-    parents, weights, scales = choose("average", window(returns), np.random.default_rng(0))
+    parents, weights, scales, _ = choose("average", window(returns), np.random.default_rng(0))
     assert weights is not None
     assert scales is None
     kept = np.flatnonzero(

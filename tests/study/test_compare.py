@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import make_run
+from scripted_runs import IDLE, start
+from short_runs import run_to_end
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
@@ -366,6 +368,31 @@ def test_lineages_are_followed_through_copies() -> None:
     assert found.ratios.tolist() == [0.5, 3.0, 0.0]
     assert found.flips.tolist() == [True, False, True]
     assert lineage.Selections.of(rows[:2]).founding == "2 of 3 founders left"
+
+
+def test_settings_are_followed_along_the_champions_line(tmp_path: Path) -> None:
+    """A run of pbt, in which place 0 takes over place 3's state: the table tells the gamma that
+    the final champion's line had at each selection, as the log has it.
+    """
+    returns, vary = [[1, 1, 9], [2], [3], [4]], {"gamma": (0.9, 0.95, 0.98, 0.99)}
+    pbt = {
+        "members": 4,
+        "rule": "pbt",
+        "select_window": 1,
+        "vary": vary,
+        "steps": 120,
+        "eval_every": 40,
+    }
+    directory = run_to_end(start(tmp_path, returns, (10,) * 4, **pbt, **IDLE))
+    after = [row["settings"]["gamma"] for row in directory.rows("select")]
+    assert [row["parents"] for row in directory.rows("select")] == [
+        [3, 1, 2, 3], [3, 1, 2, 3], [0, 0, 2, 3],
+    ]  # fmt: skip
+    (table,) = contrasts.settings(compare([directory.path]))
+    (row,) = [[cell.text for cell in row] for row in table.rows]
+    assert row[3:5] == ["gamma", "0.9 0.95 0.98 0.99"]
+    assert row[5] == lineage.shorten([0.99, 0.99, after[1][0], after[2][0]])
+    assert row[6] == " ".join(map(str, after[2]))
 
 
 def test_a_line_is_shortened_at_its_start() -> None:

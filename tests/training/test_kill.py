@@ -91,6 +91,18 @@ def test_killed_run_with_models_equals_undisturbed(tmp_path: Path) -> None:
     assert_same(only_run(tmp_path / "whole"), killed)
 
 
+@pytest.mark.slow
+def test_killed_run_of_members_that_differ_equals_undisturbed(tmp_path: Path) -> None:
+    """Their settings, perturbed by pbt, and their EMA actors go on as they were."""
+    words = ["train", "multi-td3", "Hopper-v5", "--steps", "4000", *FLAGS, "--rule", "pbt"]
+    words += ["--members", "4", "--select-window", "2", "--snapshots", "2"]
+    words += ["--vary", "critic-learning-rate=1e-4,1e-3", "--vary", "exploration_noise=0.1,0.3"]
+    killed = kill_and_resume(words, tmp_path, kills=3, seed=2)
+    assert main([*words, "--runs", str(tmp_path / "whole")]) == 0
+    assert_same(only_run(tmp_path / "whole"), killed)
+    assert any(row["kind"] == "select" and "scales" in row for row in killed.rows())
+
+
 # Signals.
 
 

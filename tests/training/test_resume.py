@@ -28,6 +28,14 @@ CASES = {
     },
     "async": {"env": "Hopper-v5", "algorithm": "multi-td3", "wait": False, "rule": "tournament"},
     "episodes": {"env": "Hopper-v5", "algorithm": "td3-paper", "hidden": (16, 16)},
+    "varied": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-td3",
+        "members": 4,
+        "rule": "pbt",
+        "select_window": 2,
+        "vary": {"gamma": (0.98, 0.99), "exploration_noise": (0.1, 0.3)},
+    },
     "sac": {"env": "Hopper-v5", "algorithm": "multi-sac"},
     "envs": {"env": "Hopper-v5", "algorithm": "sac", "num_envs": 3, "n_step": 3, "lr_end": 0.1},
     "envs-of-members": {

@@ -122,6 +122,8 @@ def add_settings(
             options["action"] = argparse.BooleanOptionalAction
         elif get_origin(info.annotation) is tuple:
             options |= {"nargs": "+", "metavar": "N"}
+        elif get_origin(info.annotation) is dict:
+            options |= {"action": "append", "metavar": "NAME=X,X"}
         else:
             options["metavar"] = "X"
         group.add_argument(flag, **options)
@@ -130,7 +132,7 @@ def add_settings(
 def _help(name: str, info: Any, defaults: Settings | None) -> str:
     """Description (range; default X); the description itself says what a default of None means."""
     notes = _allowed(info)
-    if defaults is not None and defaults[name] is not None:
+    if defaults is not None and defaults[name] not in (None, {}):
         notes.append(f"default {_show(defaults[name])}")
     text = f"{info.description} ({'; '.join(notes)})" if notes else info.description
     return text.replace("%", "%%")

@@ -8,6 +8,7 @@ from pacesetter.algorithms.contract import Learner
 from pacesetter.batch import Transition
 from pacesetter.envs import Environment, Snapshot
 from pacesetter.errors import TrainingError
+from pacesetter.learner.scales import scaled
 from pacesetter.learner.tree_arrays import flatten, rebuild
 from pacesetter.networks.forward import clip
 from pacesetter.seeding import Stream, generator
@@ -40,9 +41,10 @@ class Explorer:
         """A uniform action of the warm-up."""
         return self.warmup_stream.uniform(-1, 1, self.env.action_size).astype(np.float32)
 
-    def act(self, params: Any, observation: Floats) -> Floats:
-        """The learner's exploring action for a normalised observation."""
-        action, self.noise_state = self.learner.act(
+    def act(self, params: Any, observation: Floats, scales: dict[str, float]) -> Floats:
+        """The exploring action of a learner with scaled settings for a normalised observation."""
+        learner = scaled(self.learner, scales) if scales else self.learner
+        action, self.noise_state = learner.act(
             params, self.noise_state, observation, self.act_stream
         )
         return action

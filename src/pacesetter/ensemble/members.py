@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter import algorithms
-from pacesetter.batch import Layout, Spec
+from pacesetter.batch import Spec
 from pacesetter.config import Config
 from pacesetter.ensemble.averages import Averages
 from pacesetter.ensemble.copying import copy_from_parents
@@ -20,16 +20,16 @@ from pacesetter.ensemble.loop import Part, numbered
 from pacesetter.ensemble.policy_checkpoint import PolicyCheckpoints
 from pacesetter.ensemble.progress import Progress
 from pacesetter.ensemble.selection import Selection, Selector
+from pacesetter.ensemble.varied import spread
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
-from pacesetter.learner.compiled import CompiledLearner
+from pacesetter.learner.compiled import of_transitions
 from pacesetter.learner.learners import Learners
 from pacesetter.learner.normalizer import Normalizer
 from pacesetter.learner.schedule import factors
 from pacesetter.policy import Policy
 from pacesetter.replay.buffer import Replay, Sample, open_replays
 from pacesetter.replay.n_step import NStepQueue
-from pacesetter.seeding import Stream, generator
 
 MAX_CALLS_PER_TICK = 500  # of updates per member, so that a run can stop and save between them
 
@@ -40,14 +40,12 @@ class Members:
     def __init__(self, config: Config, envs: list[Environment]) -> None:
         run, hyper, first = config.run, config.hyper, envs[0]
         spec = Spec(first.observation_size, first.action_size)
-        learner = algorithms.find(run.algorithm).build(spec, hyper)
-        layout = Layout(spec, masks=len(learner.mask(generator(0, Stream.MASK))))
+        compiled = of_transitions(algorithms.find(run.algorithm).build(spec, hyper), run.seed)
+        learner = compiled.learner
         self.config = config
         self.updates_per_call = learner.updates_per_call
         self.budget = config.budget
         self.normalizer = Normalizer(spec.observation_size, hyper.normalize_observation)
-        normalize = self.normalizer.enabled
-        compiled = CompiledLearner(learner, layout, run.seed, normalize, hyper.precision)
         self.learners = Learners(compiled, run.members, run.seed, run.same_init)
         # Env n of member k has the number n K + k.
         self.explorers = [
@@ -59,7 +57,7 @@ class Members:
         self.selector = Selector(config, self.budget)
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
         self.averages = Averages(run, self.learners, self.current_policy(0))
-        self.progress = Progress.of(run.members)
+        self.progress = Progress.of(run.members, spread(run, hyper, run.seed))
 
     def open_replays(self, folder: Path) -> None:
         """Make or find the rings."""
@@ -78,11 +76,8 @@ class Members:
     def close(self) -> None:
         """Let go of envs, files and threads."""
         self.learners.workers.shutdown()
-        for explorer in self.explorers:
-            explorer.env.close()
-        self.selector.close()
-        for replay in self.replays:
-            replay.close()
+        for each in (*(explorer.env for explorer in self.explorers), self.selector, *self.replays):
+            each.close()
 
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""
@@ -138,7 +133,7 @@ class Members:
             action = explorer.random_action()
         else:
             seen = self.normalizer.scale(explorer.env.observation)
-            action = explorer.act(self.learners.policy_params[k], seen)
+            action = explorer.act(self.learners.policy_params[k], seen, member.scales)
             member.actions += 1
         transition = explorer.step(action, hyper.gamma, clipped=True)
         for complete in self.queues[i].push(transition):
@@ -206,8 +201,7 @@ class Members:
     def _sample(self, k: int) -> Sample:
         hyper, progress = self.config.hyper, self.progress
         progress.begin_updates(k, self.updates_per_call, hyper.batch_size)
-        horizon = (hyper.replay_horizon or 0) * self.config.steps_per_count
-        done = min(progress.step / horizon, 1.0) if horizon else 1.0
+        done = self.config.annealed(progress.step)
         shape = (self.updates_per_call, hyper.batch_size)
         return self.replay(k).sample(self.learners.sample_streams[k], shape, done)
 
@@ -236,7 +230,7 @@ class Members:
 
     def apply(self, selection: Selection) -> None:
         """Every member starts again from what was chosen for it."""
-        parents, weights, _ = selection.choice
+        parents, weights, *_ = selection.choice
         learner, copy = self.learners.compiled.learner, self.config.run.copy
         states = copy_from_parents(learner, self.learners.states, parents, copy, weights)
         self.learners.replace(states)

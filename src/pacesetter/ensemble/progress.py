@@ -7,6 +7,7 @@ from math import isfinite
 from typing import Any
 
 from pacesetter.ensemble.rules import Choice
+from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
 from pacesetter.types import Arrays, Floats
 
@@ -22,7 +23,7 @@ class Member:
     update_calls: int = 0
     updates_due: float = 0.0  # critic updates
     copied: int = 0  # step of the run at which it last became another's copy
-    scales: dict[str, float] = field(default_factory=dict[str, float])  # of learning rates
+    scales: dict[str, float] = field(default_factory=dict[str, float])  # factors of settings
 
 
 @dataclass
@@ -48,8 +49,9 @@ class Progress:
     cpu_seconds: float = 0.0
 
     @classmethod
-    def of(cls, members: int) -> "Progress":
-        return cls([Member() for _ in range(members)])
+    def of(cls, members: int, scales: Sequence[dict[str, float]] = ()) -> "Progress":
+        """A new run's; `scales` are the members' factors of settings, where they differ."""
+        return cls([Member(scales=scales[k] if scales else {}) for k in range(members)])
 
     @classmethod
     def load(cls, table: dict[str, Any]) -> "Progress":
@@ -79,14 +81,13 @@ class Progress:
         vars(self).update(vars(Progress.load(table)))
 
     def copy(self, choice: Choice) -> None:
-        """Note who became another's copy; with learning rates scaled by choice, whose they are."""
+        """Note who became another's copy, and whose settings everyone has now."""
         for k, parent in enumerate(choice.parents):
             if parent != k or choice.weights is not None:
                 self.members[k].copied = self.step
-        before = [self.members[parent].scales for parent in choice.parents]
-        for k, (member, scales) in enumerate(zip(self.members, before, strict=True)):
-            new = {n: scales.get(n, 1.0) * float(x[k]) for n, x in (choice.scales or {}).items()}
-            member.scales = scales | new
+        scales = inherited(choice, [member.scales for member in self.members])
+        for member, new in zip(self.members, scales, strict=True):
+            member.scales = new
 
     def end_episode(self, member: int, total: float, length: int) -> None:
         """Count an episode of a member, for the next row too."""

@@ -18,12 +18,15 @@ class Choice(NamedTuple):
 
     With `weights` (K, K), the new networks of member k are the mean of all, weighted by row k, and
     the parent gives what cannot be averaged, such as counters. `scales` has K factors per name of
-    a learning rate; they multiply those that member k takes over from its parent.
+    a learning rate or of a setting that varies: with them, member k takes over its parent's
+    settings, times these. `perturb` asks for random factors for some members (K,), and so for the
+    same. Without either, every member keeps its own settings.
     """
 
     parents: Parents  # (K,)
     weights: NDArray[np.float64] | None = None
     scales: dict[str, NDArray[np.float64]] | None = None
+    perturb: NDArray[np.bool_] | None = None
 
 
 Rule = Callable[[Returns, np.random.Generator], Parents | Choice]
@@ -84,6 +87,19 @@ def rescue(returns: Returns, rng: np.random.Generator) -> Parents:
     return np.where(fallen, top, np.arange(len(returns)))
 
 
+def pbt(returns: Returns, rng: np.random.Generator) -> Choice:
+    """The worst fifth starts again from members drawn of the best fifth, with perturbed settings.
+
+    Either fifth has at least one member; settings are those of --vary. Truncation selection, as in
+    population-based training (Jaderberg et al. 2017).
+    """
+    order = np.argsort(-returns.mean(axis=1), kind="stable")
+    count = max(len(order) // 5, 1)
+    parents = np.arange(len(order))
+    parents[order[len(order) - count :]] = rng.choice(order[:count], size=count)
+    return Choice(parents, perturb=parents != np.arange(len(order)))
+
+
 RULES: dict[str, Rule] = {
     "none": none,
     "best": best,
@@ -92,6 +108,7 @@ RULES: dict[str, Rule] = {
     "tournament": tournament,
     "average": average,
     "rescue": rescue,
+    "pbt": pbt,
 }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from pacesetter.config import Config
 from pacesetter.ensemble.progress import Progress
 from pacesetter.ensemble.rules import Choice, Parents, Returns, choose
+from pacesetter.ensemble.varied import decided, inherited, shown
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
 from pacesetter.evaluation import rollouts
@@ -27,12 +28,15 @@ class Selection(NamedTuple):
     returns: list[list[float]]  # (K, episodes)
     gap: float
     standard_error: float
+    settings: dict[str, list[float]]  # of each member (K,) from now on, where they vary
 
     def row(self) -> dict[str, Any]:
         """As plain JSON for the log."""
-        parents, weights, scales = self.choice
+        parents, weights, scales, _ = self.choice
         row = {"parents": parents.tolist(), **self._asdict()}
         del row["choice"]
+        if not self.settings:
+            del row["settings"]
         if weights is not None:
             row["weights"] = weights.tolist()
         if scales is not None:
@@ -69,7 +73,7 @@ class Selector:
             return None
         returns = np.array([each[-window:] for each in self.returns])
         self.returns = [[] for _ in self.returns]
-        return self._select(returns, progress.champion, paired=False)
+        return self._select(returns, progress, paired=False)
 
     def trials_are_due(self, step: int) -> bool:
         """Whether extra episodes must decide now."""
@@ -85,7 +89,7 @@ class Selector:
         self._plan_trials(progress.step)
         if progress.step >= self.budget:
             return None
-        return self._select(np.array(returns), progress.champion, paired=True)
+        return self._select(np.array(returns), progress, paired=True)
 
     def _plan_trials(self, step: int) -> None:
         every = self.config.run.select_every * self.config.steps_per_count
@@ -103,14 +107,18 @@ class Selector:
         progress.free_steps += 0 if counted else sum(trial.lengths)
         return trial.returns
 
-    def _select(self, returns: Returns, champion: int, paired: bool) -> Selection:
+    def _select(self, returns: Returns, progress: Progress, paired: bool) -> Selection:
         means, rule = returns.mean(axis=1), self.config.run.rule
+        hyper, scales = self.config.hyper, [member.scales for member in progress.members]
         choice = choose(rule, returns, self.stream)
+        choice = decided(choice, self.config.run, hyper, scales, self.stream)
+        champion = progress.champion
         if rule != "none":
             champion = find_champion(means, choice.parents)
         self.selections += 1
         gap, error = measure(returns, self.variances, paired)
-        return Selection(choice, champion, returns.tolist(), gap, error)
+        settings = shown(self.config.run, hyper, inherited(choice, scales))
+        return Selection(choice, champion, returns.tolist(), gap, error, settings)
 
     def table(self) -> dict[str, Any]:
         return {

@@ -6,9 +6,7 @@ Every random key folds (purpose, number of the member's call, member) into the r
 waiting member shifts nobody's stream and no state ever holds a key.
 """
 
-import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -21,12 +19,12 @@ from optax import incremental_update
 from pacesetter.algorithms.contract import Array, Learner, State
 from pacesetter.batch import Layout
 from pacesetter.envs import Environment
-from pacesetter.errors import UsageError
 from pacesetter.learner import products
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
-from pacesetter.learner.schedule import learning_rates
+from pacesetter.learner.scales import scaled
 from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
+from pacesetter.seeding import Stream, generator
 from pacesetter.types import Floats
 
 KEYS = 1024  # made in one call: in the update itself they would come before every product
@@ -97,8 +95,8 @@ class CompiledLearner:
     ) -> MemberUpdate:
         """One call of a member's update on rows (U, B, width); the given state is used up.
 
-        `extra` are fields of the batch that are not in rows, and `scales` factors of learning
-        rates. Members may be called from threads.
+        `extra` are fields of the batch that are not in rows, and `scales` factors of settings
+        that differ between members. Members may be called from threads.
         """
         key = self._keys(member, call // KEYS)[call % KEYS]
         inputs = (rows, weight, statistics, extra or {}, scales or {})
@@ -158,7 +156,10 @@ class CompiledLearner:
     ) -> tuple[State, Array, Array, Any]:
         batch = self._batch(rows, weight, statistics)._replace(**extra)
         whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
-        learner = _scaled(self.learner, scales) if scales else self.learner
+        learner = scaled(self.learner, scales) if scales else self.learner
+        if "gamma" in scales:  # rows hold the discount of the run's own gamma
+            share = learner.hyper.gamma / self.learner.hyper.gamma
+            batch = batch._replace(discount=batch.discount * share)
         update = learner.update(state, batch, whole)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
@@ -180,18 +181,14 @@ class CompiledLearner:
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
 
+def of_transitions(learner: Learner, seed: int) -> CompiledLearner:
+    """The program of a learner on a replay, whose rows have the masks that it wants."""
+    hyper, masks = learner.hyper, len(learner.mask(generator(0, Stream.MASK)))
+    layout = Layout(learner.spec, masks=masks)
+    return CompiledLearner(learner, layout, seed, hyper.normalize_observation, hyper.precision)
+
+
 def _key(key: Array, use: KeyUse, call: Any, member: Any) -> Array:
     for number in (int(use), call, member):
         key = jax.random.fold_in(key, number)
     return key
-
-
-def _scaled(learner: Any, scales: dict[str, Array]) -> Any:
-    """The learner with learning rates multiplied by factors, which may be traced."""
-    rates = learning_rates(learner.hyper)
-    hyper = copy.copy(learner.hyper)
-    for name, scale in scales.items():
-        if name not in rates:
-            raise UsageError(f"rule: cannot scale '{name}' of members; allowed: {', '.join(rates)}")
-        object.__setattr__(hyper, name, getattr(hyper, name) * scale)  # it is frozen, and checked
-    return replace(learner, hyper=hyper)

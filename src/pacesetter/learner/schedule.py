@@ -15,8 +15,8 @@ def linear(updates: int, horizon: float, end: float) -> float:
 
 
 def factors(hyper: Any, scales: dict[str, float], updates: int, horizon: float) -> dict[str, float]:
-    """Factors of a member's learning rates: those of selection times that of `--lr-end`."""
+    """Factors of a member's settings; those of learning rates times that of `--lr-end`."""
     if hyper.lr_end == 1:
         return scales
     factor = linear(updates, horizon, hyper.lr_end)
-    return {name: factor * scales.get(name, 1.0) for name in learning_rates(hyper)}
+    return scales | {name: factor * scales.get(name, 1.0) for name in learning_rates(hyper)}

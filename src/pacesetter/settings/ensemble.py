@@ -1,17 +1,18 @@
 """Settings of members that share a replay, which a learner on rollouts has not."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import unknown
+from pacesetter.learner.scales import VARIABLE
 from pacesetter.settings import STRICT
 from pacesetter.settings.values import Count
 
 SELECT_EVERY = 5_000  # env steps
-WINDOWS = {"rescue": 5}  # episodes behind a selection, where the default is not one
+WINDOWS = {"rescue": 5, "pbt": 5}  # episodes behind a selection, where the default is not one
 SPREAD_RULES = ("rescue",)  # that need the spread of a member's own episodes
 
 
@@ -33,6 +34,24 @@ def _check_window(value: int | None, info: ValidationInfo) -> int | None:
     return value
 
 
+def _values_by_name(value: Any) -> Any:
+    """Words such as gamma=0.98,0.99 as a table; a table from a file as it is."""
+    if isinstance(value, dict):
+        return {str(name).replace("-", "_"): each for name, each in value.items()}
+    if not isinstance(value, (list, tuple)):
+        raise ValueError("must be NAME=VALUE,VALUE or a table of lists")
+    found: dict[str, list[str]] = {}
+    for word in map(str, value):
+        name, sign, values = word.partition("=")
+        name = name.replace("-", "_")
+        if not (name and sign and values):
+            raise ValueError("must be NAME=VALUE,VALUE, such as gamma=0.98,0.99")
+        if name in found:
+            raise ValueError(f"has {name} twice; give all its values at once")
+        found[name] = values.split(",")
+    return found
+
+
 @dataclass(frozen=True, kw_only=True, config=STRICT)
 class Ensemble:
     """How many members there are, what they share, and how the best one is selected."""
@@ -52,7 +71,7 @@ class Ensemble:
     select_window: Annotated[int | None, AfterValidator(_check_window)] = Field(
         None,
         ge=1,
-        description="episodes per member behind each selection; default 1, with --rule rescue 5",
+        description="episodes per member behind each selection; default 1, with rescue or pbt 5",
     )
     select_after: Count | None = Field(
         None, ge=0, description="env steps before the first selection; default --warmup"
@@ -72,6 +91,15 @@ class Ensemble:
     )
     replay_scope: Literal["shared", "member"] = Field(
         "shared", description="one shared replay, or one per member"
+    )
+    vary: Annotated[dict[str, tuple[float, ...]], BeforeValidator(_values_by_name)] = Field(
+        default_factory=dict,
+        description="settings that differ between members, such as gamma=0.98,0.99; may be "
+        f"repeated; one of {', '.join(VARIABLE)}",
+    )
+    vary_by: Literal["grid", "draw"] = Field(
+        "grid",
+        description="give members the points of the grid of --vary, or draw each value as often",
     )
     mean_actions: Literal["auto", "on", "off"] = Field(
         "auto",

@@ -6,6 +6,7 @@ from typing import Any
 from pacesetter.config import Config
 from pacesetter.ensemble.averages import mean_action
 from pacesetter.ensemble.loop import Loop
+from pacesetter.ensemble.varied import shown
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
 from pacesetter.evaluation import Act, Evaluation, rollouts
@@ -40,6 +41,9 @@ class Evaluator:
         values = trial.table() | {"champion": progress.champion}
         if means := self._mean_actions(policy):
             values["mean_actions"] = means
+        if run.vary:
+            scales = [member.scales for member in progress.members]
+            values["settings"] = shown(run, self.config.hyper, scales)
         if ending and run.rule == "none" and run.members > 1:
             members = range(run.members)
             values["members"] = [self._trial(self.policy(k).act, k).mean for k in members]

@@ -105,7 +105,7 @@ class OnPolicyLoop:
         progress, params = self.progress, self.learners.policy_params[0]
         if explorer.starting:
             explorer.start(params, progress.step)
-        action = explorer.act(params, self.normalizer.scale(explorer.env.observation))
+        action = explorer.act(params, self.normalizer.scale(explorer.env.observation), {})
         transition = explorer.step(action, self.config.hyper.gamma, clipped=False)
         progress.members[0].steps += 1
         progress.members[0].actions += 1

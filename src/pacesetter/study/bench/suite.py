@@ -156,6 +156,8 @@ def _flags(settings: Settings) -> Iterable[str]:
         flag = key.replace("_", "-")
         if key == "env_kwargs":
             yield from (f"--env.{name}={json.dumps(each)}" for name, each in value.items())
+        elif isinstance(value, dict):
+            yield from (f"--{flag}={n}={','.join(map(str, each))}" for n, each in value.items())
         elif isinstance(value, bool):
             yield f"--{flag}" if value else f"--no-{flag}"
         elif isinstance(value, (tuple, list)):

@@ -1,5 +1,6 @@
 """Selections of a run: how certain each was, and which member descends from which."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -75,7 +76,16 @@ class Selections:
         return found[::-1]
 
 
-def shorten(line: list[int], most: int = 12) -> str:
+def settings_along(found: Selections, varied: list[Any], name: str) -> list[float]:
+    """A setting's values along the line of the last champion (S + 1,).
+
+    `varied` has the values of all members by name, at the start and after each selection.
+    """
+    places = [*found.line, int(found.champions[-1])]
+    return [values[name][place] for values, place in zip(varied, places, strict=True)]
+
+
+def shorten(line: Sequence[float], most: int = 12) -> str:
     """A line with repeats counted, such as 0 1x3 0x2; its end, if it is long."""
     words = [
         f"{place}x{count}" if count > 1 else str(place)

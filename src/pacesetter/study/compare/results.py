@@ -123,6 +123,12 @@ class Run:
         """A row of SELECTION for each selection up to the cut."""
         return [row for row in self.table.get("selections", []) if row[0] <= self.steps[-1]]
 
+    @property
+    def varied(self) -> list[Any]:
+        """Values of the settings that differ, by name (K,): at the start and after each selection
+        up to the cut; empty where none differ."""
+        return self.table.get("varied", [])[: len(self.selections) + 1]
+
 
 def compact(run: RunDirectory) -> Row:
     """A run as one line: config, versions, commit, evaluations with their ledger, selections."""
@@ -137,9 +143,17 @@ def compact(run: RunDirectory) -> Row:
             "selections": [
                 [row[column] for column in SELECTION] for row in rows if row["kind"] == "select"
             ],
+            **_varied(rows),
         }
     except (KeyError, TypeError) as error:
         raise UsageError(f"{run.metrics_file}: damaged: {error} is missing in a row") from None
+
+
+def _varied(rows: list[Row]) -> Row:
+    """The members' settings at the start and after each selection, if they differ."""
+    found = [row["settings"] for row in rows[:1] if "settings" in row]
+    found += [row["settings"] for row in rows if row["kind"] == "select" and "settings" in row]
+    return {"varied": found} if found else {}
 
 
 def _extra(evaluations: list[Row]) -> list[str]:

@@ -147,3 +147,33 @@ def selections(comparison: Comparison) -> list[Table]:
         "through which the final champion descends, from the first selection to the last.",
     ]
     return [Table("Selections", headers, rows, notes)]
+
+
+def settings(comparison: Comparison) -> list[Table]:
+    """Members that differ: what they began with, and how the champion's settings came to be."""
+    rows: list[list[Cell]] = []
+    for group in comparison.groups:
+        for run in (run for run in group.runs if run.varied and run.selections):
+            found = lineage.Selections.of(run.selections)
+            for name, first in run.varied[0].items():
+                line = lineage.settings_along(found, run.varied, name)
+                rows.append(
+                    [
+                        word(group.env),
+                        word(group.name),
+                        number(run.seed),
+                        word(name),
+                        word(" ".join(map(str, first))),
+                        word(lineage.shorten(line)),
+                        word(" ".join(map(str, run.varied[-1][name]))),
+                    ]
+                )
+    if not rows:
+        return []
+    headers = ["env", "algorithm", "seed", "setting", "members at the start"]
+    headers += ["line of the champion", "members at the end"]
+    notes = [
+        "Line: the setting's value where the final champion descends from, before each selection "
+        "and at the end."
+    ]
+    return [Table("Settings of members", headers, rows, notes)]

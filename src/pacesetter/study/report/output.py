@@ -92,5 +92,5 @@ def own(comparison: Comparison) -> list[Table]:
     found = [contents.overview(comparison), *contrasts.against(comparison)]
     found += [contents.details(comparison), contents.speed(comparison)]
     found += [*contrasts.together(comparison), *contrasts.best_of_two(comparison)]
-    found += contrasts.selections(comparison)
+    found += [*contrasts.selections(comparison), *contrasts.settings(comparison)]
     return [*found, contents.ledger(comparison.groups)]
