@@ -823,3 +823,15 @@ def test_ray_cluster(jobs: list[Job]) -> None:
 
         ray.shutdown()
         cluster.shutdown()
+
+
+def test_arms_of_the_ensemble_suite_spend_what_it_says() -> None:
+    """A learner of any arm makes 95k updates in 100k own steps, or twice both in `single-200k`."""
+    file = Path(__file__).parents[2] / "results" / "ensemble.toml"
+    for job in expand(load(str(file)), {}, "runs"):
+        run, hyper = job.config
+        steps = job.config.budget / run.members
+        updates = (job.config.budget - hyper.warmup) / run.members * hyper.updates_per_step
+        times = 2 if run.name == "single-200k" else 1
+        assert (steps, updates) == (times * 100_000, times * 95_000), run.name
+        assert (run.members, run.wait) in {(1, True), (2, False)}
