@@ -24,7 +24,7 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.config import resolve
 from pacesetter.dynamics import fit as fitting
 from pacesetter.dynamics.model import Dynamics, Models
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.policy import Policy
 from pacesetter.seeding import Stream
 from pacesetter.types import Floats
@@ -110,7 +110,7 @@ def main() -> None:
     folder = Path(__file__).parent.parent / "champions"
     files = sorted(folder.glob("HalfCheetah*")) if chosen.policy is None else chosen.policy
     policies = [policy.load(file) for file in files]
-    env = Environment(chosen.env, {}, chosen.seed, Stream.REPORT)
+    env = Environment(Recipe(chosen.env), chosen.seed, Stream.REPORT)
     rows = collect(env, chosen.rows, policies, chosen.seed)
     held = collect(env, max(chosen.rows // 4, 1_000), policies, chosen.seed + 1)
     spec = Spec(env.observation_size, env.action_size)

@@ -15,7 +15,7 @@ from tabulate import tabulate
 
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.seeding import Stream
 
 LEARNERS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -51,7 +51,7 @@ def megaflops(name: str, spec: Spec, **settings: Any) -> float:
 
 def spec_of(env: str) -> Spec:
     """Sizes of a task."""
-    world = Environment(env, {}, 0, Stream.REPORT)
+    world = Environment(Recipe(env), 0, Stream.REPORT)
     world.close()
     return Spec(world.observation_size, world.action_size)
 

@@ -143,10 +143,10 @@ def time_env(env: str, steps: int, seed: int) -> float:
     """Steps/s of the env with actions of no learner, as training steps it."""
     import numpy as np
 
-    from pacesetter.envs import Environment
+    from pacesetter.envs import Environment, Recipe
     from pacesetter.seeding import Stream
 
-    task, rng = Environment(env, {}, seed, Stream.TRAIN), np.random.default_rng(seed)
+    task, rng = Environment(Recipe(env), seed, Stream.TRAIN), np.random.default_rng(seed)
     task.reset()
     began = perf_counter()
     for _ in range(steps):

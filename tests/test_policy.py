@@ -14,7 +14,7 @@ import pytest
 from short_runs import TINY, run_to_end
 
 from pacesetter.cli.main import main
-from pacesetter.envs import make
+from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.networks import mlp
@@ -40,7 +40,7 @@ def make_policy(
     env: str, rng: np.random.Generator, actors: int = 1, norm: bool = False, scale: bool = False
 ) -> Policy:
     """A random policy for a task."""
-    task = make(env)
+    task = Recipe(env).make()
     space: Any = task.action_space
     size = int(np.prod(task.observation_space.shape or ()))
     task.close()

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
@@ -18,6 +18,9 @@ from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settin
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import build, fields_of
 from pacesetter.settings.values import Count, Duration
+
+if TYPE_CHECKING:
+    from pacesetter.envs import Recipe
 
 
 def _check_json(value: dict[str, Any]) -> dict[str, Any]:
@@ -51,6 +54,11 @@ class Task:
         description="earlier run, or policy file, whose networks the members start with",
     )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
+    renew_env: bool | None = Field(
+        None,
+        description="make the task anew at each episode, so that none depends on those before it; "
+        "default where a test at the start finds that one would",
+    )
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -75,6 +83,13 @@ class Config(NamedTuple):
 
     run: Run
     hyper: Any
+
+    @property
+    def recipe(self) -> "Recipe":
+        """How the run's task is made."""
+        from pacesetter.envs import Recipe
+
+        return Recipe(self.run.env, self.run.env_kwargs)
 
     @property
     def steps_per_count(self) -> int:

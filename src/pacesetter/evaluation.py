@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter.consent import require
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.envs.border import reward_terms
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy
@@ -108,7 +108,8 @@ def enter(
     own = env_kwargs
     if own is None:
         own = about.get("env_kwargs", {}) if name == about.get("env") else {}
-    world = Environment(name, own | extra, seed, Stream.REPORT)
+    renew = bool(about.get("renew_env")) and name == about.get("env")
+    world = Environment(Recipe(name, own | extra, renew), seed, Stream.REPORT)
     world.check()
     if policy is not None:
         _refuse_unfit(policy, world)

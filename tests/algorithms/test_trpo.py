@@ -488,7 +488,7 @@ def test_killed_run_equals_undisturbed(tmp_path: Path) -> None:
 
 def test_fault_of_an_env_is_named(runs: Path) -> None:
     """Env 1 acts second in each turn, so its step 5 is the run's step 13 of three envs."""
-    settings = {**RUN, "steps": 300}
+    settings = {**RUN, "steps": 300, "renew_env": False}
     Late.arm("nan", victim=1, at=5)
     trainer = Trainer("trpo", "broken_envs:Late-v0", runs=runs, **settings)
     with pytest.raises(TrainingError, match=r"^env 1, step 13: .*observation"):

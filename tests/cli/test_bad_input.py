@@ -15,7 +15,7 @@ import broken_envs
 import numpy as np
 import pytest
 import safetensors.numpy
-from short_runs import TINY, assert_same, run_to_end
+from short_runs import TINY, assert_same, run_to_end, run_to_step
 
 from pacesetter import storage
 from pacesetter.cli.main import main
@@ -349,25 +349,10 @@ def halfway(tmp_path_factory: pytest.TempPathFactory) -> Path:
     settings = {**TINY, "steps": 700, "eval_every": 200}
     trainer = Trainer("td3", PROBE, runs=tmp_path_factory.mktemp("halfway") / "runs", **settings)
     for step in (300, 500):
-        stop_at(trainer, step)
+        run_to_step(trainer, step)
         trainer = Trainer.resume(trainer.directory.path)
     trainer.close()
     return trainer.directory.path
-
-
-def stop_at(trainer: Trainer, step: int) -> None:
-    """Run until so many steps are made, then end as a signal would."""
-    tick = trainer.loop.tick
-
-    def tick_and_stop() -> Any:
-        selection = tick()
-        if trainer.progress.step >= step:
-            trainer.stop()
-        return selection
-
-    trainer.loop.tick = tick_and_stop
-    run_to_end(trainer)
-    assert trainer.progress.step == step
 
 
 @pytest.fixture

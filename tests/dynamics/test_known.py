@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pacesetter.dynamics import known_rewards
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.seeding import Stream
 
@@ -27,7 +27,7 @@ class Trajectory(NamedTuple):
 
 def trajectory(name: str, steps: int) -> Trajectory:
     """Steps of actions that are held for a while, so that bodies get going and fall."""
-    env, rng = Environment(name, {}, 0, Stream.REPORT), np.random.default_rng(4)
+    env, rng = Environment(Recipe(name), 0, Stream.REPORT), np.random.default_rng(4)
     columns: list[list[Any]] = [[] for _ in Trajectory._fields]
     env.reset()
     for i in range(steps):

@@ -25,7 +25,7 @@ from pacesetter.batch import Layout
 from pacesetter.ensemble.copying import copy_from_parents
 from pacesetter.ensemble.rules import RULES, Choice, choose
 from pacesetter.ensemble.selection import POOLED_SELECTIONS, Selection, measure
-from pacesetter.envs import Environment, environment
+from pacesetter.envs import Environment, Recipe, environment
 from pacesetter.errors import UsageError
 from pacesetter.learner.compiled import KEYS, CompiledLearner, KeyUse
 from pacesetter.policy import normalize
@@ -402,7 +402,7 @@ def test_selection_on_trials_chooses_by_their_mean(runs: Path) -> None:
     trainer = start(
         runs, returns=([9], [0]), steps=130, select_on="eval", select_every=50, select_window=2
     )
-    trainer.loop.selector.trial_env = Environment(ENV, {}, 0, Stream.SELECT)
+    trainer.loop.selector.trial_env = Environment(Recipe(ENV), 0, Stream.SELECT)
     script(trainer.loop.selector.trial_env, returns=[1, 3, 5, 9])
     (row,) = select_rows(trainer)
     assert (row["step"], row["returns"]) == (90, [[1, 3], [5, 9]])

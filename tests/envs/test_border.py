@@ -7,7 +7,7 @@ import pytest
 from odd_envs import Mute
 from short_runs import TINY, log, run_to_end
 
-from pacesetter.envs import Environment, border
+from pacesetter.envs import Environment, Recipe, border
 from pacesetter.errors import reason, show
 from pacesetter.evaluation import rollouts
 from pacesetter.seeding import Stream
@@ -28,7 +28,7 @@ NOTES = {
 
 
 def world(name: str) -> Environment:
-    return Environment(f"odd_envs:{name}-v0", {}, 3, Stream.TRAIN)
+    return Environment(Recipe(f"odd_envs:{name}-v0"), 3, Stream.TRAIN)
 
 
 @pytest.mark.parametrize("name", NOTES)
@@ -44,7 +44,7 @@ def test_what_is_cast_is_noted_in_one_line(name: str) -> None:
 @pytest.mark.parametrize("name", ["WideObservation", "LineReward", "PointReward", "LineFlags"])
 def test_what_is_cast_is_what_was_meant(name: str, rng: np.random.Generator) -> None:
     """Steps equal those of the task that gives them as it should, in value and in type."""
-    plain, odd = Environment("broken_envs:Probe-v0", {}, 3, Stream.TRAIN), world(name)
+    plain, odd = Environment(Recipe("broken_envs:Probe-v0"), 3, Stream.TRAIN), world(name)
     assert np.array_equal(plain.reset(), odd.reset())
     for _ in range(100):
         action = rng.uniform(-1, 1, 2).astype(np.float32)

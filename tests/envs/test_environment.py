@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 from broken_envs import Restless
-from short_runs import TINY, run_to_end
+from short_runs import TINY, run_to_step
 
-from pacesetter.envs import Environment, known, make
+from pacesetter.envs import Environment, Recipe, known
 from pacesetter.errors import TrainingError
 from pacesetter.evaluation import rollouts
 from pacesetter.policy import to_env
@@ -32,7 +32,7 @@ SIZES = {
 
 
 def world(name: str, seed: int = 3, index: int = 0, **kwargs: Any) -> Environment:
-    return Environment(name, kwargs, seed, Stream.TRAIN, index)
+    return Environment(Recipe(name, kwargs), seed, Stream.TRAIN, index)
 
 
 @pytest.mark.parametrize("name", SIZES)
@@ -211,17 +211,10 @@ def test_env_that_does_not_repeat_is_reported(runs: Any) -> None:
     """The run says so, starts a new episode, and goes on."""
     settings = {**TINY, "steps": 260, "warmup": 250, "name": "restless"}
     trainer = Trainer("td3", f"broken_envs:{Restless.__name__}-v0", runs=runs, **settings)
-    tick = trainer.loop.tick
-
-    def tick_and_stop() -> Any:
-        trainer.stop()
-        return tick()
-
-    trainer.loop.tick = tick_and_stop
-    run_to_end(trainer)
-    assert trainer.progress.step == 1
+    run_to_step(trainer, 1)
     resumed = Trainer.resume(trainer.directory.path)
-    (note,) = resumed.notes
+    general, note = resumed.notes
+    assert "does not repeat an episode from its seed, so a resumed run differs" in general
     assert "env 0" in note
     assert "Restless-v0 does not repeat" in note
     assert "\n" not in note
@@ -231,20 +224,13 @@ def test_env_that_does_not_repeat_is_reported(runs: Any) -> None:
 
 def test_env_that_remembers_earlier_episodes_is_reported(runs: Any) -> None:
     """The observations repeat, but what the episode earned does not."""
-    settings = {**TINY, "steps": 260, "warmup": 260, "eval_every": 260, "name": "ageing"}
+    settings = {**TINY, "steps": 260, "warmup": 260, "eval_every": 260, "renew_env": False}
     trainer = Trainer("td3", "broken_envs:Ageing-v0", runs=runs, **settings)
-    tick = trainer.loop.tick
-
-    def tick_and_stop() -> Any:
-        if trainer.progress.step == 150:
-            trainer.stop()
-        return tick()
-
-    trainer.loop.tick = tick_and_stop
-    run_to_end(trainer)
+    run_to_step(trainer, 150)
     resumed = Trainer.resume(trainer.directory.path)
     resumed.close()
-    (note,) = resumed.notes
+    general, note = resumed.notes
+    assert "is kept from one episode to the next" in general
     assert "Ageing-v0 does not repeat" in note
 
 
@@ -256,6 +242,6 @@ def test_known_tasks() -> None:
 
 
 def test_env_keywords_reach_the_task() -> None:
-    env = make("Ant-v5", {"include_cfrc_ext_in_observation": False})
+    env = Recipe("Ant-v5", {"include_cfrc_ext_in_observation": False}).make()
     assert env.observation_space.shape == (27,)
     env.close()

@@ -110,4 +110,28 @@ class BareAssert(Probe):
         assert "ground" in words
 
 
+class Warm(Probe):
+    """A body that stays warm: late in an episode it tells how many came before."""
+
+    heat = 0
+
+    def reset(self, **options: Any) -> Any:
+        self.heat += 1
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        if self.count > 80:
+            self.point[0] += self.heat / 1000
+        return super().step(action)
+
+
+class Fails(Probe):
+    """Its motor burns after some steps of every episode."""
+
+    def step(self, action: Any) -> Any:
+        if self.count > 30:
+            raise RuntimeError("the motor is on fire")
+        return super().step(action)
+
+
 register(__name__)

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from pacesetter.envs import make
+from pacesetter.envs import Recipe
 from pacesetter.policy import Policy
 
 
 def untrained(env: str, **about: Any) -> Policy:
     """One linear layer of the right size."""
-    world = make(env)
+    world = Recipe(env).make()
     box: Any = world.action_space
     observations, actions = world.observation_space.shape, box.shape
     low, high = box.low.astype(np.float32), box.high.astype(np.float32)

@@ -46,3 +46,19 @@ def run_to_end(trainer: Trainer) -> RunDirectory:
     for _ in trainer:
         pass
     return trainer.directory
+
+
+def run_to_step(trainer: Trainer, step: int) -> RunDirectory:
+    """Train until so many steps are made, then end as a signal would."""
+    tick = trainer.loop.tick
+
+    def tick_and_stop() -> Any:
+        selection = tick()
+        if trainer.progress.step >= step:
+            trainer.stop()
+        return selection
+
+    trainer.loop.tick = tick_and_stop
+    run_to_end(trainer)
+    assert trainer.progress.step == step
+    return trainer.directory

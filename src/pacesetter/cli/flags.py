@@ -118,7 +118,7 @@ def add_settings(
             continue
         options: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": name}
         options["help"] = argparse.SUPPRESS if name in hidden else _help(name, info, defaults)
-        if info.annotation is bool:
+        if info.annotation in (bool, bool | None):
             options["action"] = argparse.BooleanOptionalAction
         elif get_origin(info.annotation) is tuple:
             options |= {"nargs": "+", "metavar": "N"}

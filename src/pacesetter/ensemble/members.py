@@ -54,7 +54,7 @@ class Members:
         ]
         self.queues = [NStepQueue(hyper.n_step) for _ in envs]
         self.replays: list[Replay] = []
-        self.selector = Selector(config, self.budget)
+        self.selector = Selector(config, self.budget, first.recipe)
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
         self.averages = Averages(run, self.learners, self.current_policy(0))
         self.progress = Progress.of(run.members, spread(run, hyper, run.seed))

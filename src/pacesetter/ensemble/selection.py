@@ -10,7 +10,7 @@ from pacesetter.config import Config
 from pacesetter.ensemble.progress import Progress
 from pacesetter.ensemble.rules import Choice, Parents, Returns, choose
 from pacesetter.ensemble.varied import decided, inherited, shown
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import blame
 from pacesetter.evaluation import rollouts
 from pacesetter.policy import Policy
@@ -47,8 +47,8 @@ class Selection(NamedTuple):
 class Selector:
     """Selects by the rule of the settings; the members apply what it returns."""
 
-    def __init__(self, config: Config, budget: int) -> None:
-        self.config, self.budget = config, budget
+    def __init__(self, config: Config, budget: int, recipe: Recipe) -> None:
+        self.config, self.budget, self.recipe = config, budget, recipe
         self.stream = generator(config.run.seed, Stream.RULE)
         self.returns: list[list[float]] = [[] for _ in range(config.run.members)]
         self.variances: list[float] = []  # of the last selections
@@ -98,7 +98,7 @@ class Selector:
     def _trial(self, k: int, policy: Policy, progress: Progress) -> list[float]:
         run = self.config.run
         if self.trial_env is None:
-            self.trial_env = Environment(run.env, run.env_kwargs, run.seed, Stream.SELECT)
+            self.trial_env = Environment(self.recipe, run.seed, Stream.SELECT)
         first, counted = self.selections * run.window, run.count_selection_steps
         limit = self.budget - progress.step if counted else inf
         with blame(k, progress.step):

@@ -3,9 +3,9 @@
 import gymnasium
 
 from pacesetter.envs.environment import Environment, Snapshot, Step
-from pacesetter.envs.tasks import known, make
+from pacesetter.envs.tasks import Recipe, known
 
-__all__ = ["Environment", "Snapshot", "Step", "known", "make"]
+__all__ = ["Environment", "Recipe", "Snapshot", "Step", "known"]
 
 gymnasium.register(
     "pacesetter/Ant111-v4",

@@ -7,7 +7,7 @@ import numpy as np
 
 from pacesetter.envs import border
 from pacesetter.envs.spaces import action_bounds
-from pacesetter.envs.tasks import make
+from pacesetter.envs.tasks import Recipe
 from pacesetter.errors import TrainingError, UsageError, reason
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
@@ -42,14 +42,13 @@ class Environment:
     """One env and its running episode.
 
     Each reset is seeded by the episode's number. An episode is therefore restored by its number and
-    its actions, whatever the simulator is.
+    its actions, whatever the simulator is. One that carries state from one episode to the next is
+    made anew at each.
     """
 
-    def __init__(
-        self, name: str, kwargs: dict[str, Any], seed: int, stream: Stream, index: int = 0
-    ) -> None:
-        self.env = make(name, kwargs)
-        self.name, self.seed, self.stream, self.index = name, seed, stream, index
+    def __init__(self, recipe: Recipe, seed: int, stream: Stream, index: int = 0) -> None:
+        self.recipe, self.env = recipe, recipe.make()
+        self.name, self.seed, self.stream, self.index = recipe.name, seed, stream, index
         space: Any = self.env.action_space
         self.low, self.high = action_bounds(self.env)
         self.action_shape: tuple[int, ...] = space.shape
@@ -57,6 +56,7 @@ class Environment:
         self.observation_shape: tuple[int, ...] = self.env.observation_space.shape or ()
         self.observation_size = int(np.prod(self.observation_shape))
         self.action_size = len(self.low)
+        self.new = True  # no episode has begun in it
         self.episode = -1
         self.actions: list[Floats] = []
         self.earned = 0.0  # rewards of the episode so far
@@ -68,6 +68,10 @@ class Environment:
         """Start an episode by its number, by default the next one."""
         self.episode = self.episode + 1 if episode is None else episode
         self.actions, self.earned = [], 0.0
+        if self.recipe.renew and not self.new:
+            self.close()
+            self.env = self._call("episode", self.recipe.make)
+        self.new = False
         seed = episode_seed(self.seed, self.stream, self.index, self.episode)
         result: Any = self._call("reset", lambda: self.env.reset(seed=seed))
         if not (isinstance(result, tuple) and len(result) == 2):

@@ -3,12 +3,14 @@
 import logging
 import re
 import warnings
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 
 from pacesetter.envs.spaces import check_spaces
 from pacesetter.errors import UsageError, reason, unknown
+from pacesetter.settings import Settings
 
 
 def known() -> list[str]:
@@ -36,8 +38,26 @@ def make_quietly(name: str, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
 
 
-def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, Any]:
-    """Make a task by its Gymnasium id. Raises UsageError if the id or the task is wrong."""
+@dataclass(frozen=True)
+class Recipe:
+    """How a task is made, as often as it is needed: by its Gymnasium id and keywords."""
+
+    name: str
+    kwargs: Settings = field(default_factory=dict)
+    renew: bool = False  # make it anew at each episode
+
+    def make(self) -> gymnasium.Env[Any, Any]:
+        """A new env. Raises UsageError if the id or the task is wrong."""
+        _refuse_unknown(self.name)
+        try:
+            env = make_quietly(self.name, self.kwargs)
+        except Exception as error:
+            raise UsageError(f"env: cannot make '{self.name}': {reason(error)}") from None
+        check_spaces(self.name, env)
+        return env
+
+
+def _refuse_unknown(name: str) -> None:
     plain = name.split(":")[-1]
     if not re.search(r"-v\d+$", plain, re.IGNORECASE) and name not in known():
         versions = [known_name for known_name in known() if known_name.startswith(f"{plain}-v")]
@@ -45,9 +65,3 @@ def make(name: str, kwargs: dict[str, Any] | None = None) -> gymnasium.Env[Any, 
         raise UsageError(f"env: '{name}' has no version{hint}")
     if ":" not in name and name not in known():
         raise unknown("env", name, known(), see="pacesetter list envs")
-    try:
-        env = make_quietly(name, kwargs or {})
-    except Exception as error:
-        raise UsageError(f"env: cannot make '{name}': {reason(error)}") from None
-    check_spaces(name, env)
-    return env

@@ -7,7 +7,7 @@ from pacesetter.config import Config
 from pacesetter.ensemble.averages import mean_action
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.varied import shown
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import blame
 from pacesetter.evaluation import Act, Evaluation, rollouts
 from pacesetter.policy import Policy
@@ -19,8 +19,8 @@ from pacesetter.seeding import Stream
 class Evaluator:
     """Rolls out the champion of a loop, its other members, and their mean actions."""
 
-    def __init__(self, loop: Loop, config: Config, directory: RunDirectory) -> None:
-        self.loop, self.config, self.directory = loop, config, directory
+    def __init__(self, loop: Loop, config: Config, directory: RunDirectory, recipe: Recipe) -> None:
+        self.loop, self.config, self.directory, self.recipe = loop, config, directory, recipe
         self._env: Environment | None = None
 
     def policy(self, member: int | None = None) -> Policy:
@@ -29,6 +29,7 @@ class Evaluator:
         policy = self.loop.policy(progress.champion if member is None else member)
         names = ("env", "env_kwargs", "algorithm", "name", "seed")
         policy.about.update({name: getattr(run, name) for name in names})
+        policy.about.update(renew_env=self.recipe.renew)
         policy.about.update(step=progress.step, versions=versions())
         return policy
 
@@ -77,7 +78,7 @@ class Evaluator:
     def _trial(self, act: Act, member: int) -> Evaluation:
         run = self.config.run
         if self._env is None:
-            self._env = Environment(run.env, run.env_kwargs, run.seed, Stream.EVALUATE)
+            self._env = Environment(self.recipe, run.seed, Stream.EVALUATE)
         with blame(member, self.loop.progress.step):
             return rollouts(act, self._env, run.eval_episodes)
 

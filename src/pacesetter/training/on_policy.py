@@ -51,7 +51,7 @@ class OnPolicyLoop:
         params = self.learners.policy_params[0]
         self.explorers = [Explorer(learner, env, params, run.seed, i) for i, env in enumerate(envs)]
         source = AllSteps if isinstance(hyper, ModelDriven) else LastRollout
-        self.source: AllSteps | LastRollout = source(config, self.layout)
+        self.source: AllSteps | LastRollout = source(config, self.layout, first.recipe)
         self.progress = Progress.of(1)
 
     def open_replays(self, folder: Path) -> None:

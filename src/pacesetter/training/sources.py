@@ -7,7 +7,7 @@ import numpy as np
 
 from pacesetter.batch import Layout
 from pacesetter.config import Config
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.replay.buffer import UNCOMMITTED, Replay
 from pacesetter.seeding import Stream
@@ -20,7 +20,7 @@ MIN_ROLLOUT = 250  # rows, of which a fifth is held out by a fit
 class LastRollout:
     """The rollout just made, in time order: (T, E, width)."""
 
-    def __init__(self, config: Config, layout: Layout) -> None:
+    def __init__(self, config: Config, layout: Layout, recipe: Recipe) -> None:
         self.envs, self.layout = config.hyper.parallel_envs, layout
         self.length = config.hyper.rollout_length
         self.replays: list[Replay] = []
@@ -45,7 +45,7 @@ class AllSteps:
     Starts are resets of an env of their own, each seeded by its number, so no state is kept.
     """
 
-    def __init__(self, config: Config, layout: Layout) -> None:
+    def __init__(self, config: Config, layout: Layout, recipe: Recipe) -> None:
         run, hyper = config.run, config.hyper
         self.layout, self.starts = layout, hyper.starts
         self.capacity = min(hyper.replay_size, run.steps)
@@ -56,7 +56,7 @@ class AllSteps:
                 f"{min(UNCOMMITTED, hyper.replay_size)} steps, it has {rollout}"
             )
         self.size = hyper.replay_size
-        self.env = Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, hyper.parallel_envs)
+        self.env = Environment(recipe, run.seed, Stream.TRAIN, hyper.parallel_envs)
         self.replays: list[Replay] = []
 
     def open(self, path: Path, budget: int) -> None:

@@ -1,6 +1,7 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
@@ -8,7 +9,8 @@ from pacesetter.config import resolve
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, apart
+from pacesetter.envs.apart import Apart
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
@@ -71,10 +73,10 @@ class Trainer:
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
-        self._begin()
+        self._begin(None)
         if self.config.run.start_from is not None:
             start_from(self.loop, self.config, runs)
-        self.directory.create(self.config, **made_with(products.of(self.config.hyper)))
+        self.directory.create(self.config, **self._made_with())
         try:
             self.loop.open_replays(self.directory.state_file.parent)
             checkpoint.save(self.loop, self.config, self.directory)
@@ -108,7 +110,7 @@ class Trainer:
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
         checkpoint.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
-        self._begin()
+        self._begin(apart.recorded(self.directory.record()))
         self.directory.lock()
         try:
             self.directory.sweep()
@@ -118,8 +120,7 @@ class Trainer:
             if self.progress.step > self.budget:
                 made = f"{self.progress.step:,}"
                 raise UsageError(f"steps: the run has made {made} already; give more")
-            found = made_with(products.of(self.config.hyper))
-            self.directory.note_resume(self.config, self.progress.step, **found)
+            self.directory.note_resume(self.config, self.progress.step, **self._made_with())
         except BaseException:
             self.directory.unlock()
             raise
@@ -130,19 +131,27 @@ class Trainer:
         done = f"{self.progress.step:,} of {self.budget:,} steps"
         return f"Trainer({run.name} on {run.env}, seed {run.seed}: {done}, {self.directory.path})"
 
-    def _begin(self) -> None:
+    def _begin(self, before: Apart | None) -> None:
+        """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
         run, hyper = self.config
         on_policy = isinstance(hyper, OnPolicy)
+        self.apart = before or apart.choose(self.config.recipe, run.renew_env)
+        recipe = replace(self.config.recipe, renew=self.apart is Apart.BY_RENEWAL)
         envs = [
-            Environment(run.env, run.env_kwargs, run.seed, Stream.TRAIN, index)
+            Environment(recipe, run.seed, Stream.TRAIN, index)
             for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
         ]
-        self.notes += envs[0].check()
+        cast = envs[0].check()
+        self.notes += [] if before else cast
+        self.notes += apart.notes(self.apart, run.env, resumed=before is not None)
         self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
-        self._evaluator = Evaluator(self.loop, self.config, self.directory)
+        self._evaluator = Evaluator(self.loop, self.config, self.directory, recipe)
         self._reports: list[Report] = []
         self._stopping = self._closed = False
         self._clock = Clock()
+
+    def _made_with(self) -> dict[str, Any]:
+        return {"apart": self.apart, **made_with(products.of(self.config.hyper))}
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""

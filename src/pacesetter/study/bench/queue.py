@@ -104,11 +104,9 @@ class Bench:
 
     def check_envs(self) -> None:
         """Refuse a task that cannot be made, before anything starts."""
-        from pacesetter.envs import make
-
         tasks = {(job.config.run.env, str(job.config.run.env_kwargs)): job for job in self.left}
         for job in tasks.values():
-            make(job.config.run.env, job.config.run.env_kwargs).close()
+            job.config.recipe.make().close()
 
     def run(self, executor: Executor) -> Iterator[None]:
         """Run until all have finished, failed or, after `stop`, saved; yields at each poll."""

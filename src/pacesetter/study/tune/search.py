@@ -18,7 +18,6 @@ import numpy as np
 
 from pacesetter import algorithms
 from pacesetter.config import resolve
-from pacesetter.envs import make
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.settings import Settings
@@ -81,7 +80,7 @@ class Tuning:
         if not self.file.name or self.file.is_dir():
             raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
         refuse_foreign(self.file)
-        make(self.env, self.config.run.env_kwargs).close()
+        self.config.recipe.make().close()
 
     def stop(self) -> None:
         """Ask for the end once the running trial has saved; may be called from a handler."""
