@@ -83,7 +83,7 @@ REFUSED: list[tuple[Any, str]] = [
     (np.array(["1", "2", "3"]), "must be numbers"),
     (None, "must be numbers|must have shape"),
     (Mute(), "must be numbers, got a Mute that cannot be printed"),
-    (np.zeros((3, 1)), r"must have shape \(3,\) as its space has, has \(3, 1\)"),
+    (np.zeros((3, 1)), r"must have shape \(3,\) as its space, has \(3, 1\)"),
     ([0.0, 1e300, 0.0], r"must be finite, number 1 is 1e\+300"),
     (np.float32([0, 0, np.nan]), "must be finite, number 2 is nan"),
 ]
@@ -116,7 +116,7 @@ def test_rewards_beyond_float32() -> None:
 @pytest.mark.parametrize("given", [2, -1, 0.5, np.nan, np.array([True, False]), "", None, []])
 def test_flags_that_are_refused(given: Any) -> None:
     with pytest.raises(ValueError, match=r"must be True or False|must be one number"):
-        border.flag(given)
+        border.flag("terminated", given)
 
 
 def test_the_reason_of_an_exception() -> None:

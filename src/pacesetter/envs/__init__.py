@@ -2,7 +2,8 @@
 
 import gymnasium
 
-from pacesetter.envs.environment import Environment, Snapshot, Step
+from pacesetter.envs.border import Step
+from pacesetter.envs.environment import Environment, Snapshot
 from pacesetter.envs.tasks import Recipe, known
 
 __all__ = ["Environment", "Recipe", "Snapshot", "Step", "known"]

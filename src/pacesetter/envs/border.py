@@ -4,15 +4,41 @@ A ValueError says what is wrong and how to mend the task. Notes say what was cas
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pacesetter.errors import show
 from pacesetter.types import Floats, Shape
 
-MAX_REWARD = float(np.finfo(np.float32).max)  # the replay keeps rewards in float32
+LARGEST = np.finfo(np.float32).max  # the replay keeps all numbers in float32
+MAX_REWARD = float(LARGEST)
 ROUNDING = 1e-6  # of a bound; float32 has seven digits
+
+
+class Step(NamedTuple):
+    """What one env step gave; `terminated` ends the task, `truncated` only the episode."""
+
+    observation: Floats
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: Mapping[Any, Any]
+
+    @property
+    def ended(self) -> bool:
+        return self.terminated or self.truncated
+
+
+def step(given: Any, shape: Shape) -> Step:
+    """What `step` of a task returned, whose observations have a shape."""
+    if not (isinstance(given, tuple) and len(given) == 5):
+        raise ValueError("step: must return (observation, reward, terminated, truncated, info)")
+    seen, paid, terminated, truncated, info = given
+    if not isinstance(info, (dict, Mapping)):
+        raise ValueError(f"info: must be a dict, got {show(info)}; {{}} will do")
+    flags = flag("terminated", terminated), flag("truncated", truncated)
+    return Step(observation(seen, shape), reward(paid), *flags, info)
 
 
 def observation(given: Any, shape: Shape) -> Floats:
@@ -21,49 +47,42 @@ def observation(given: Any, shape: Shape) -> Floats:
         raw = np.asarray(given)
         if raw.dtype.kind not in "bfiuO":
             raise TypeError
-        with np.errstate(over="ignore"):
-            array = np.array(raw, np.float32)
+        inside = np.abs(raw) <= LARGEST
+        finite = inside.all()
+        flat = np.array(raw if finite else 0, np.float32).ravel()
     except Exception:
-        raise ValueError(f"must be numbers, got {show(given)}") from None
-    if array.shape != shape and not array.size == np.prod(shape) == 1:
-        raise ValueError(f"must have shape {shape} as its space has, has {array.shape}")
-    flat = array.ravel()
-    if not np.isfinite(flat).all():
-        where = int(np.flatnonzero(~np.isfinite(flat))[0])
-        raise ValueError(f"must be finite, number {where} is {raw.ravel()[where]}")
+        raise ValueError(f"observation: must be numbers, got {show(given)}") from None
+    if raw.shape != shape and not raw.size == np.prod(shape) == 1:
+        raise ValueError(f"observation: must have shape {shape} as its space, has {raw.shape}")
+    if not finite:
+        n = int(np.flatnonzero(~inside)[0])
+        raise ValueError(f"observation: must be finite, number {n} is {raw.ravel()[n]}")
     return flat
 
 
 def reward(given: Any) -> float:
     """One finite number, which may come as an array of one."""
-    number = given if isinstance(given, (int, float, np.floating)) else _single(given)
+    number = given if isinstance(given, (int, float, np.floating)) else _single("reward", given)
     if not abs(number) <= MAX_REWARD:
-        raise ValueError(f"must be finite in float32, got {show(given)}")
+        raise ValueError(f"reward: must be finite in float32, got {show(given)}")
     return float(number)
 
 
-def flag(given: Any) -> bool:
+def flag(what: str, given: Any) -> bool:
     """True or False, which may come as 0 or 1 or as an array of one."""
-    if not isinstance(given, (bool, np.bool_)) and _single(given) not in (0, 1):
-        raise ValueError(f"must be True or False, got {show(given)}")
+    if not isinstance(given, (bool, np.bool_)) and _single(what, given) not in (0, 1):
+        raise ValueError(f"{what}: must be True or False, got {show(given)}")
     return bool(given)
 
 
-def info(given: Any) -> Mapping[Any, Any]:
-    """A dict with whatever keys."""
-    if not isinstance(given, Mapping):
-        raise ValueError(f"must be a dict, got {show(given)}; {{}} will do")
-    return given
-
-
-def _single(given: Any) -> Any:
+def _single(what: str, given: Any) -> Any:
     try:
         array = np.asarray(given)
         if array.size == 1 and array.dtype.kind in "bfiu":
             return array.item()
     except Exception:  # of a ragged list, or of an object that only looks like an array
         pass
-    raise ValueError(f"must be one number, got {show(given)}")
+    raise ValueError(f"{what}: must be one number, got {show(given)}")
 
 
 def reward_terms(given: Mapping[Any, Any]) -> Iterator[tuple[str, float]]:
@@ -95,7 +114,7 @@ def notes_on_observation(given: Any, space: Any) -> Iterator[str]:
         yield f"observation number {n} is {values[n]}, outside its space [{low[n]}, {high[n]}]"
 
 
-def notes_on_step(given: list[Any]) -> Iterator[str]:
+def notes_on_step(given: tuple[Any, ...]) -> Iterator[str]:
     """What was cast of a reward and two flags."""
     paid, *flags = given
     if isinstance(paid, bool) or not isinstance(paid, (int, float, np.floating, np.integer)):

@@ -1,11 +1,12 @@
 """One env and its running episode: float32, actions in [-1, 1], seeded and resumed exactly."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pacesetter.envs import border
+from pacesetter.envs.border import Step
 from pacesetter.envs.spaces import action_bounds
 from pacesetter.envs.tasks import Recipe
 from pacesetter.errors import TrainingError, UsageError, reason
@@ -14,20 +15,6 @@ from pacesetter.seeding import Stream, episode_seed
 from pacesetter.types import Floats
 
 MAX_EPISODE = 100_000  # steps; an episode that never ends would hang every evaluation
-
-
-class Step(NamedTuple):
-    """What one env step gave; `terminated` ends the task, `truncated` only the episode."""
-
-    observation: Floats
-    reward: float
-    terminated: bool
-    truncated: bool
-    info: Mapping[Any, Any]
-
-    @property
-    def ended(self) -> bool:
-        return self.terminated or self.truncated
 
 
 class Snapshot(NamedTuple):
@@ -61,7 +48,7 @@ class Environment:
         self.actions: list[Floats] = []
         self.earned = 0.0  # rewards of the episode so far
         self.given: Any = None  # the last observation as the env gave it
-        self.paid: list[Any] = []  # the last reward and flags as the env gave them
+        self.paid: tuple[Any, ...] = ()  # the last reward and flags as the env gave them
         self.observation = np.zeros(self.observation_size, np.float32)
 
     def reset(self, episode: int | None = None) -> Floats:
@@ -73,34 +60,31 @@ class Environment:
             self.env = self._call("episode", self.recipe.make)
         self.new = False
         seed = episode_seed(self.seed, self.stream, self.index, self.episode)
-        result: Any = self._call("reset", lambda: self.env.reset(seed=seed))
+        result: Any = self._call("reset", self.env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
-            raise self._broken("reset", "must return (observation, info)")
-        self.observation = self._observation(result[0])
+            raise self._broken("reset: must return (observation, info)")
+        try:
+            self.observation = border.observation(result[0], self.observation_shape)
+        except ValueError as error:
+            raise self._broken(error) from None
+        self.given = result[0]
         return self.observation
 
     def step(self, action: Floats) -> Step:
         """One step with an action (A,) in [-1, 1]."""
         if len(self.actions) >= MAX_EPISODE:
             why = f"has not ended after {MAX_EPISODE:,} steps; give the task a limit, such as"
-            raise self._broken("episode", f"{why} --env.max_episode_steps 1000")
+            raise self._broken(f"episode: {why} --env.max_episode_steps 1000")
         self.actions.append(action)
         scaled = to_env(action, self.low, self.high)
         scaled = scaled.reshape(self.action_shape).astype(self.action_type)
-        result: Any = self._call("step", lambda: self.env.step(scaled))
-        if not (isinstance(result, tuple) and len(result) == 5):
-            raise self._broken(
-                "step", "must return (observation, reward, terminated, truncated, info)"
-            )
-        observation, *self.paid, info = result
-        self.observation = self._observation(observation)
-        step = Step(
-            self.observation,
-            self._cast("reward", border.reward, result[1]),
-            self._cast("terminated", border.flag, result[2]),
-            self._cast("truncated", border.flag, result[3]),
-            self._cast("info", border.info, info),
-        )
+        result: Any = self._call("step", self.env.step, scaled)
+        try:
+            step = border.step(result, self.observation_shape)
+        except ValueError as error:
+            raise self._broken(error) from None
+        self.given, self.paid = result[0], result[1:4]
+        self.observation = step.observation
         self.earned += step.reward
         return step
 
@@ -136,21 +120,11 @@ class Environment:
     def close(self) -> None:
         self._call("close", self.env.close)
 
-    def _call(self, what: str, function: Callable[[], Any]) -> Any:
+    def _call(self, what: str, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
         try:
-            return function()
+            return function(*given, **named)
         except Exception as error:
-            raise self._broken(what, f"failed: {reason(error)}") from error
+            raise self._broken(f"{what}: failed: {reason(error)}") from error
 
-    def _cast(self, what: str, function: Callable[..., Any], *given: Any) -> Any:
-        try:
-            return function(*given)
-        except ValueError as error:
-            raise self._broken(what, str(error)) from None
-
-    def _observation(self, given: Any) -> Floats:
-        self.given = given
-        return self._cast("observation", border.observation, given, self.observation_shape)
-
-    def _broken(self, what: str, why: str) -> TrainingError:
-        return TrainingError(f"{self.name}: {what}: {why}")
+    def _broken(self, why: object) -> TrainingError:
+        return TrainingError(f"{self.name}: {why}")
