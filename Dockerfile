@@ -4,7 +4,8 @@ FROM python:3.12-slim
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libegl1 libgl1 \
     && rm -rf /var/lib/apt/lists/*
-COPY pyproject.toml README.md LICENSE /source/
+COPY pyproject.toml hatch_build.py README.md LICENSE /source/
+COPY champions /source/champions
 COPY src /source/src
 RUN pip install --no-cache-dir /source && rm -r /source
 WORKDIR /work

@@ -41,3 +41,16 @@ def test_targets_that_pages_name_are_there() -> None:
     named = set(re.findall(r"^make ([\w-]+)|`make ([\w-]+)`", text, re.MULTILINE))
     assert {one or other for one, other in named} <= made
     assert len(named) > 4
+
+
+def test_the_image_has_what_the_build_needs() -> None:
+    """All that pyproject.toml and its build hook read is copied, and nothing else is sent."""
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    wheel = tool["targets"]["wheel"]
+    needed = {*wheel["force-include"], *(Path(name).parts[0] for name in wheel["packages"])}
+    needed |= {"pyproject.toml", "hatch_build.py", PROJECT["readme"], *PROJECT["license-files"]}
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    copied = {word for line in lines if line.startswith("COPY ") for word in line.split()[1:-1]}
+    assert copied == needed
+    sent = (ROOT / ".dockerignore").read_text().split()
+    assert {line.removeprefix("!") for line in sent if line != "*"} == needed
