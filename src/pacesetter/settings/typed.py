@@ -25,6 +25,10 @@ class RunSettings(TypedDict, total=False):
     """budget of env steps, all members together"""
     time: float | str | None
     """stop after this wall time, such as 2h; default no limit"""
+    stop_at: float | None
+    """stop at the first evaluation whose mean return is this; default never"""
+    start_from: str | None
+    """earlier run, or policy file, whose networks the members start with"""
     seed: int
     """seed of every random stream"""
     members: int
@@ -61,6 +65,8 @@ class RunSettings(TypedDict, total=False):
     """env steps between evaluations"""
     eval_episodes: int
     """episodes per evaluation"""
+    keep: int
+    """policies of the last evaluations to keep in the folder policies/"""
     checkpoint_every: float | str
     """time between checkpoints, such as 5m"""
     device: Literal["auto", "cpu", "gpu", "tpu"]

@@ -38,21 +38,24 @@ def pdf(comparison: Comparison, path: Path, window: int | None = None) -> None:
 
 
 def picture(comparison: Comparison, path: Path, window: int | None = None) -> None:
-    """One PNG or SVG: below each task's curves its intervals."""
+    """One PNG or SVG: each task's curves, and its intervals below or, for one task, beside them."""
     import matplotlib
 
     envs = comparison.envs
     columns = min(COLUMNS, len(envs))
     rows = -(-len(envs) // columns)
-    figure, panels = _figure(2 * rows, columns)
-    for place in range(rows * columns):
+    figure, panels = _figure(2 * rows, columns) if len(envs) > 1 else _figure(1, 2)
+    for panel in panels.flat:
+        panel.set_visible(False)
+    for place, env in enumerate(envs):
         row, column = 2 * (place // columns), place % columns
-        above, below = panels[row, column], panels[row + 1, column]
-        if place < len(envs):
-            _curves(above, comparison, envs[place], "steps", window)
-            _intervals(below, comparison, envs[place])
-        for panel in (above, below):
-            panel.set_visible(place < len(envs))
+        above = panels[row, column]
+        below = panels[row + 1, column] if len(envs) > 1 else panels[0, 1]
+        _curves(above, comparison, env, "steps", window)
+        above.get_legend().remove()  # the intervals name the colours
+        _intervals(below, comparison, env)
+        above.set_visible(True)
+        below.set_visible(True)
     _head(figure, f"{title(comparison)}: mean over seeds and 95% t interval{_smoothed(window)}")
     about = {"Date": None} if path.suffix == ".svg" else {}
     with matplotlib.rc_context({"svg.hashsalt": "pacesetter"}):
@@ -120,12 +123,14 @@ def _intervals(panel: Any, comparison: Comparison, env: str) -> None:
     styles, groups = style(comparison.names), comparison.on(env)
     for place, group in enumerate(groups):
         values = group.values(comparison.metric)
-        found, colour = stats.mean(values), styles[group.name][0]
-        panel.hlines(place, found.low, found.high, color=colour, linewidth=3, alpha=0.45)
+        found, (colour, dashes) = stats.mean(values), styles[group.name]
+        line: Any = {"linewidth": 3, "alpha": 0.45, "linestyle": _pattern(dashes)}
+        panel.hlines(place, found.low, found.high, color=colour, **line)
         panel.plot(values, [place] * len(values), "o", color=colour, fillstyle="none", markersize=4)
         panel.plot(found.value, place, "o", color=colour, markersize=7)
         label, across = f"{group.name} (n={len(group.runs)})", panel.get_yaxis_transform()
-        panel.text(0.01, place - 0.2, label, va="bottom", fontsize="x-small", transform=across)
+        about: Any = {"fontsize": "x-small", "va": "bottom"}
+        panel.text(0.01, place - 0.2, label, transform=across, **about)
     panel.set_yticks([])
     panel.set_ylim(len(groups) - 0.5, -0.8)
     _label(panel, env, NAMES[comparison.metric].lower(), "")
@@ -210,9 +215,14 @@ def _smoothed(window: int | None) -> str:
     return f"; smoothed for the eye by Savitzky-Golay, window {window}, order {order}"
 
 
+def _pattern(dashes: str) -> Any:
+    """SVG dashes as matplotlib takes them."""
+    return (0, tuple(int(n) / 2 for n in dashes.split())) if dashes else "-"
+
+
 def _draw(panel: Any, line: Curve, style: tuple[str, str], label: str) -> None:
     colour, dashes = style
-    pattern = (0, tuple(int(n) / 2 for n in dashes.split())) if dashes else "-"
+    pattern = _pattern(dashes)
     mark = "o" if len(line.x) == 1 else None  # a line of one point is not seen
     panel.plot(
         line.x, line.mean, color=colour, linestyle=pattern, label=label, linewidth=1.5, marker=mark
