@@ -18,6 +18,7 @@ from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settin
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import build, fields_of
 from pacesetter.settings.values import Count, Duration
+from pacesetter.text import check_id
 
 if TYPE_CHECKING:
     from pacesetter.envs import Recipe
@@ -35,8 +36,12 @@ def _check_json(value: dict[str, Any]) -> dict[str, Any]:
 class Task:
     """What to train, where, and for how long."""
 
-    algorithm: str = Field(description="algorithm; see `pacesetter list algorithms`")
-    env: str = Field(description="Gymnasium id with its version, or module:Id-v0")
+    algorithm: Annotated[str, AfterValidator(check_id)] = Field(
+        description="algorithm; see `pacesetter list algorithms`"
+    )
+    env: Annotated[str, AfterValidator(check_id)] = Field(
+        description="Gymnasium id with its version, or module:Id-v0"
+    )
     env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
         default_factory=dict, description="keywords for gymnasium.make"
     )

@@ -6,6 +6,8 @@ from pathlib import Path
 from traceback import extract_tb
 from typing import Any
 
+from pacesetter.text import printable
+
 MAX_LENGTH = 500  # characters
 SHOWN = 80  # characters of a value that is not what it should be
 
@@ -14,7 +16,7 @@ class _OneLine(Exception):  # noqa: N818
     code = 1  # with which the command ends
 
     def __init__(self, message: str) -> None:
-        text = " ".join(message.split())
+        text = printable(" ".join(message.split()))
         super().__init__(text if len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}...")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from pacesetter import storage
 from pacesetter.errors import UsageError
 from pacesetter.networks.forward import ACTIVATIONS, ENCODER, OUTPUTS, clip, forward, has_encoder
+from pacesetter.text import check_id
 from pacesetter.types import Floats, Layers, Shape
 
 KIND = "policy"
@@ -149,10 +150,12 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     about: Any = policy.about
     if not isinstance(about, dict):
         raise ValueError("about must be a table")
-    kinds = {"env": str, "env_kwargs": dict, "step": int}
+    kinds = {"env": str, "algorithm": str, "name": str, "env_kwargs": dict, "step": int}
     for name, kind in kinds.items():
         if not isinstance(about.get(name, kind()), kind):
             raise ValueError(f"{name} must be a {kind.__name__}")
+    for name in about.keys() & {"env", "algorithm", "name"}:
+        check_id(about[name])
     for name, array in arrays.items():
         if array.dtype != np.float32 or array.size == 0 or not np.isfinite(array).all():
             raise ValueError(f"{name} must hold finite float32 numbers")

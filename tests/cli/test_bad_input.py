@@ -585,7 +585,7 @@ def test_list_goes_on_after_a_damaged_run(
     capsys.readouterr()
     assert main(["list", "runs", "--runs", str(run.path.parents[2])]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert any(str(run.path) in line and "damaged or foreign: 'steps'" in line for line in lines)
+    assert any(str(run.path) in line and "settings.steps is missing" in line for line in lines)
     assert any(str(copy) in line and "of 700" in line for line in lines)
 
 

@@ -257,7 +257,7 @@ def test_words_from_runs_are_shown_as_words(tmp_path: Path) -> None:
     run = make_run(tmp_path / "runs", budget=20_000, evaluations=10)
     config = json.loads((run / "config.json").read_text())
     evil = "</script><script>alert(1)</script>"
-    config["settings"]["env"] = f"{evil}-v1"
+    config["settings"]["env_kwargs"] = {"xml_file": evil}
     config["command"] = evil
     (run / "config.json").write_text(json.dumps(config))
     text = write(tmp_path / "report.html", run, "--no-film")
@@ -315,3 +315,22 @@ def test_one_short_run_without_an_update_is_drawn(browser: Any, tmp_path: Path) 
         chart.send_keys(Keys.ARROW_RIGHT)
         assert "NaN" not in browser.find_element("css selector", ".chart").get_property("outerHTML")
     assert browser.get_log("browser") == []
+
+
+def test_words_leave_as_words_of_other_programs(tmp_path: Path) -> None:
+    """Keywords of a task may hold anything; a table, a comment or a terminal must not."""
+    run = make_run(tmp_path / "runs", budget=20_000, evaluations=10)
+    config = json.loads((run / "config.json").read_text())
+    evil = "a\n\\input{/etc/passwd}\x1b[31m|b|<i>[x](y)$\\z$"
+    config["settings"]["env_kwargs"] = {"xml_file": evil}
+    (run / "config.json").write_text(json.dumps(config))
+    tex = write(tmp_path / "a.tex", run)
+    page = write(tmp_path / "a.md", run)
+    write(tmp_path / "a.svg", run)
+    for text in (tex, page):
+        assert "\x1b" not in text
+        assert not any(line.startswith("\\input") for line in text.splitlines())
+    code = "\n".join(line for line in tex.splitlines() if not line.startswith("%"))
+    assert "\\input" not in code
+    assert "<i>" not in page
+    assert "[x](y)" not in page

@@ -12,6 +12,7 @@ from pacesetter.cli.show import evaluations, state
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, find_all
 from pacesetter.storage import as_json
+from pacesetter.text import printable
 
 WIDTH = 88  # columns of a paragraph
 
@@ -160,4 +161,5 @@ def _words(value: Any) -> str:
 
 
 def _table(rows: list[list[str]], headers: tuple[str, ...] = ()) -> str:
+    rows = [[printable(cell) for cell in row] for row in rows]
     return tabulate(rows, headers=headers, tablefmt="plain", disable_numparse=True)

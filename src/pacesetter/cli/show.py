@@ -9,6 +9,7 @@ from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
 from pacesetter.settings.budget import budget, is_spent
 from pacesetter.storage import as_json
+from pacesetter.text import printable
 
 SHOWN = 5  # evaluations, unless all are asked for
 COUNTS = ("member_steps", "selection_steps", "updates", "transitions", "episodes")
@@ -91,5 +92,5 @@ def _text(told: Row, most: int | None) -> str:
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> str:
-    shown = [["-" if cell is None else cell for cell in row] for row in rows]
+    shown = [["-" if cell is None else printable(str(cell)) for cell in row] for row in rows]
     return tabulate(shown, headers=headers, tablefmt="plain", disable_numparse=True)

@@ -1,8 +1,10 @@
 """One env, the episode that runs in it, and the noise of whoever explores it."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from pacesetter.algorithms.contract import Learner
 from pacesetter.batch import Transition
@@ -12,7 +14,20 @@ from pacesetter.learner.scales import scaled
 from pacesetter.learner.tree_arrays import flatten, rebuild
 from pacesetter.networks.forward import clip
 from pacesetter.seeding import Stream, generator
+from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import Arrays, Floats
+
+
+@dataclass
+class _Saved:
+    """An explorer in a checkpoint."""
+
+    streams: list[dict[str, Any]]
+    episode: Annotated[int, Field(ge=-1, le=10**15)]
+    earned: Finite
+    starting: bool
+    active: bool
+    started: Natural
 
 
 class Explorer:
@@ -94,6 +109,7 @@ class Explorer:
         """The inverse of `arrays` and `table`; a note if the env does not repeat the running
         episode exactly, so that another one begins.
         """
+        check(_Saved, table)
         for stream, state in zip(self.streams, table["streams"], strict=True):
             stream.bit_generator.state = state
         self.noise_state = rebuild({"noise_state": self.noise_state}, arrays)["noise_state"]

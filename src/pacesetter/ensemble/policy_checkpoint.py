@@ -12,6 +12,7 @@ from typing import Any
 from pacesetter.ensemble.rules import Parents
 from pacesetter.learner.tree_arrays import below, flatten, rebuild
 from pacesetter.policy import Policy
+from pacesetter.settings.validation import Natural, check
 from pacesetter.types import Arrays
 
 LONG_AFTER = 750_000  # updates (TD7)
@@ -46,6 +47,15 @@ class Assessment:
         if verdict is not None:
             self.returns, self.over = [], True
         return verdict
+
+
+@dataclass
+class _Saved:
+    """All assessments in a checkpoint; each list has one entry per member."""
+
+    assessments: list[Assessment]
+    kept: list[dict[str, Any] | None]
+    verdicts: list[tuple[Natural, bool]]
 
 
 class PolicyCheckpoints:
@@ -110,6 +120,9 @@ class PolicyCheckpoints:
 
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays` and `table`."""
+        check(_Saved, table)
+        if not len(table["assessments"]) == len(table["kept"]) == len(self.kept):
+            raise ValueError(f"assessments of {len(table['assessments'])} members")
         self.assessments = [Assessment(**each) for each in table["assessments"]]
         self.verdicts = table["verdicts"]
         for k, about in enumerate(table["kept"]):

@@ -4,26 +4,32 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from math import isfinite
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from pacesetter.ensemble.rules import Choice
 from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
+from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import Arrays, Floats
 
 TRAIN_ROW_EVERY = 1_000  # steps
+
+
+Ended = Annotated[list[Finite], Field(min_length=3, max_length=3)]  # member, return, length
 
 
 @dataclass
 class Member:
     """One member's counters."""
 
-    steps: int = 0
-    actions: int = 0  # of its steps, those that its learner chose
-    update_calls: int = 0
-    updates_due: float = 0.0  # critic updates
-    copied: int = 0  # step of the run at which it last became another's copy
-    scales: dict[str, float] = field(default_factory=dict[str, float])  # factors of settings
+    steps: Natural = 0
+    actions: Natural = 0  # of its steps, those that its learner chose
+    update_calls: Natural = 0
+    updates_due: Finite = 0.0  # critic updates
+    copied: Natural = 0  # step of the run at which it last became another's copy
+    scales: dict[str, Finite] = field(default_factory=dict[str, float])  # factors of settings
 
 
 @dataclass
@@ -31,22 +37,22 @@ class Progress:
     """Where a run is."""
 
     members: list[Member]
-    tick: int = 0
-    selection_steps: int = 0
-    free_steps: int = 0  # of selection, those that the budget does not count
-    updates: int = 0
-    transitions: int = 0
-    episodes: int = 0
-    champion: int = 0
-    next_evaluation: int = 0
+    tick: Natural = 0
+    selection_steps: Natural = 0
+    free_steps: Natural = 0  # of selection, those that the budget does not count
+    updates: Natural = 0
+    transitions: Natural = 0
+    episodes: Natural = 0
+    champion: Natural = 0
+    next_evaluation: Natural = 0
     last_evaluation: int = -1
-    next_train: int = TRAIN_ROW_EVERY
-    best: float | None = None
-    ended: list[list[float]] = field(default_factory=list[list[float]])  # since the last row
-    losses: dict[str, float] = field(default_factory=dict[str, float])  # sums since the last row
-    summed: int = 0  # how many losses were summed
-    wall_seconds: float = 0.0
-    cpu_seconds: float = 0.0
+    next_train: Natural = TRAIN_ROW_EVERY
+    best: Finite | None = None
+    ended: list[Ended] = field(default_factory=list[Ended])  # since the last row
+    losses: dict[str, Finite] = field(default_factory=dict[str, float])  # sums since the last row
+    summed: Natural = 0  # how many losses were summed
+    wall_seconds: Finite = 0.0
+    cpu_seconds: Finite = 0.0
 
     @classmethod
     def of(cls, members: int, scales: Sequence[dict[str, float]] = ()) -> "Progress":
@@ -55,7 +61,8 @@ class Progress:
 
     @classmethod
     def load(cls, table: dict[str, Any]) -> "Progress":
-        """The inverse of `table`."""
+        """The inverse of `table`. Raises a ValueError that names a counter of the wrong kind."""
+        check(cls, table)
         members: Any = [Member(**member) for member in table["members"]]
         return cls(**(table | {"members": members}))
 
@@ -78,7 +85,10 @@ class Progress:
 
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `table`, in place."""
-        vars(self).update(vars(Progress.load(table)))
+        found = Progress.load(table)
+        if not found.champion < len(found.members) == len(self.members):
+            raise ValueError(f"{len(found.members)} members, champion {found.champion}")
+        vars(self).update(vars(found))
 
     def copy(self, choice: Choice) -> None:
         """Note who became another's copy, and whose settings everyone has now."""

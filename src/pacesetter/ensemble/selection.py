@@ -1,6 +1,7 @@
 """Who sets the pace: selections on training episodes or on extra trials, and how sure each was."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from pacesetter.errors import blame
 from pacesetter.evaluation import rollouts
 from pacesetter.policy import Policy
 from pacesetter.seeding import Stream, generator
+from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import Arrays
 
 POOLED_SELECTIONS = 20
@@ -42,6 +44,17 @@ class Selection(NamedTuple):
         if scales is not None:
             row["scales"] = {name: factors.tolist() for name, factors in scales.items()}
         return row
+
+
+@dataclass
+class _Saved:
+    """The selector in a checkpoint."""
+
+    stream: dict[str, Any]
+    returns: list[list[Finite]]
+    variances: list[Finite]
+    selections: Natural
+    next_trials: Natural
 
 
 class Selector:
@@ -134,6 +147,9 @@ class Selector:
 
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `table`."""
+        check(_Saved, table)
+        if len(table["returns"]) != len(self.returns):
+            raise ValueError(f"returns of {len(table['returns'])} members")
         self.stream.bit_generator.state = table["stream"]
         self.returns, self.variances = table["returns"], table["variances"]
         self.selections, self.next_trials = table["selections"], table["next_trials"]

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from pacesetter.learner.tree_arrays import rebuild
 from pacesetter.policy import normalize
 from pacesetter.types import Arrays, Floats, Reals
 
@@ -53,4 +54,4 @@ class Normalizer:
 
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays`."""
-        self.sums, self._statistics = arrays["sums"], None
+        self.sums, self._statistics = rebuild({"sums": self.sums}, arrays)["sums"], None

@@ -14,6 +14,7 @@ from pacesetter.errors import InUseError, UsageError
 from pacesetter.runs.lock import WITHOUT, Lock
 from pacesetter.runs.log import Log, Row
 from pacesetter.runs.provenance import provenance
+from pacesetter.runs.records import SCHEMA, check_record
 from pacesetter.settings.validation import difference
 from pacesetter.storage import (
     NOT_REGULAR,
@@ -25,7 +26,6 @@ from pacesetter.storage import (
     write_atomically,
 )
 
-SCHEMA = 1
 CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.
 FREE_PER_SEED = {
@@ -169,17 +169,12 @@ class RunDirectory:
         """The whole config.json."""
         try:
             table = json.loads(read_bytes(self.config_file))
-            if table["schema"] != SCHEMA:
-                raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
-            if not isinstance(table.get("threads"), int):
-                raise ValueError("threads must be a whole number")
-            if not all(isinstance(table["settings"][key], str) for key in ("algorithm", "env")):
-                raise ValueError("algorithm and env must be words")
+            check_record(table)
         except FileNotFoundError:
             raise UsageError(f"run: {self.path} holds no run (no config.json)") from None
         except OSError as error:
             raise UsageError(f"{self.config_file}: cannot be read: {error.strerror}") from None
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise UsageError(f"{self.config_file}: damaged or foreign: {error}") from None
         return table
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.runs.records import check_row
 from pacesetter.storage import as_json, present, read_bytes, regular
 
 Row = dict[str, Any]
@@ -24,8 +25,8 @@ class Log:
         try:
             lines = self.read().decode().split("\n")[:-1]
             found = [json.loads(line) for line in lines if line.startswith(starts)]
-            if not all(isinstance(row, dict) for row in found):
-                raise ValueError("a line is not a table")
+            for row in found:
+                check_row(row)
         except (ValueError, RecursionError) as error:
             raise UsageError(f"{self.path}: damaged: {error}") from None
         return found

@@ -1,6 +1,7 @@
 """A whole run to a file and back, bit for bit; each part of the loop saves and restores itself."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from pacesetter.process import threads
 from pacesetter.replay.buffer import Replay
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
+from pacesetter.settings.validation import Natural, check
 from pacesetter.storage import Content
 from pacesetter.types import Arrays
 
@@ -24,6 +26,16 @@ SCHEMA = 4
 # What a run is given anew by flags of `resume`, or what changes no result of it.
 FREE_ON_RESUME = {"steps", "time", "name", "checkpoint_every", "device"}
 LATER = ("averages",)  # parts that the first checkpoints of this schema have not
+
+
+@dataclass
+class _Header:
+    """What a checkpoint says of itself, beside its parts."""
+
+    log: Natural  # bytes of the log
+    threads: Natural
+    products: str = "xla"
+    log_hash: str | None = None  # old ones have none
 
 
 class _Refused(UsageError):  # noqa: N818
@@ -103,7 +115,8 @@ def _restore(
     arrays, table = storage.read(file, KIND)
     _refuse_strangers(file, table, config)
     try:
-        size = int(table["log"])
+        check(_Header, table)
+        size: int = table["log"]
         _refuse_other_log(directory, size, table.get("log_hash"))
         for name, part in loop.parts().items():
             if name in LATER and name not in table:

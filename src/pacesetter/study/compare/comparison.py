@@ -159,7 +159,7 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     if any(run.settings.get("count_selection_steps") is False for run in runs):
         notes.append("Steps of selection come on top of the env steps where a run left them out.")
     for key, what in (("eval_every", "evaluations come at"), ("eval_episodes", "episodes differ")):
-        if len({run.settings[key] for run in runs}) > 1:
+        if len({run.settings.get(key) for run in runs}) > 1:
             notes.append(f"Settings of the evaluation differ ({key}): {what} other numbers.")
     for key, what in (("threads", "thread counts"), ("machine", "machines")):
         if len({str(run.table[key]) for run in runs}) > 1:

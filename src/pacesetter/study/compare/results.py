@@ -6,15 +6,19 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from glob import glob
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from pacesetter.errors import UsageError
-from pacesetter.runs import SCHEMA, Row, RunDirectory, find, find_all, find_group, find_matching
+from pacesetter.runs import Row, RunDirectory, find, find_all, find_group, find_matching
+from pacesetter.runs.records import check_record
 from pacesetter.settings.budget import budget, is_spent, steps_per_count
+from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.stats import Array
+from pacesetter.text import printable
 
 COLUMNS = ("step", "returns", "updates", "transitions", "cpu_seconds", "wall_seconds")
 AXES = {
@@ -25,9 +29,23 @@ AXES = {
 }
 PROVENANCE = ("command", "versions", "commit", "threads", "machine")
 SELECTION = ("step", "gap", "standard_error", "parents", "champion")
+LARGEST = 1e60  # of a number in them, so that no square is infinite
 DECIMALS = 3  # of a return in a line of results
 # Numbers in an evaluation's row that are not spent; the others are counts of an algorithm.
 _NOT_SPENT = {"mean", "std", "champion", "episodes", *COLUMNS}
+
+
+_Spent = Annotated[Finite, Field(ge=-LARGEST, le=LARGEST)]
+
+
+class _Line(BaseModel):
+    """A line of results, beside what a config.json holds."""
+
+    columns: list[str]
+    evaluations: list[list[_Spent | Annotated[list[_Spent], Field(min_length=1)]]]
+    selections: list[tuple[Natural, Finite | None, Finite | None, list[Natural], Natural]] = Field(
+        []
+    )
 
 
 @dataclass(frozen=True)
@@ -56,7 +74,7 @@ class Run:
     def env(self) -> str:
         """The task: env id with version, and keywords if there are any."""
         kwargs = self.settings.get("env_kwargs") or {}
-        return " ".join([self.settings["env"], *(f"{k}={v}" for k, v in kwargs.items())])
+        return printable(" ".join([self.settings["env"], *(f"{k}={v}" for k, v in kwargs.items())]))
 
     @property
     def name(self) -> str:
@@ -172,8 +190,8 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         missing = [key for key in PROVENANCE if key not in table]
         if missing:
             raise ValueError(f"no {', '.join(missing)}; a result without them is not compared")
-        if table["schema"] != SCHEMA:
-            raise ValueError(f"schema {table['schema']}, this version reads {SCHEMA}")
+        check_record(table)
+        check(_Line, table)
         names = table["columns"][len(COLUMNS) :]
         if table["columns"] != [*COLUMNS, *names]:
             raise ValueError(f"columns must begin with {', '.join(COLUMNS)}")
@@ -184,12 +202,13 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         arrays = [np.array(column, dtype=float) for column in columns]
         extra = dict(zip(names, arrays[len(COLUMNS) :], strict=True))
         run = Run(source, table, *arrays[: len(COLUMNS)], extra=extra, folder=folder)
-        if not np.isfinite(arrays).all():
-            raise ValueError("an evaluation is not finite")
-        hash((run.env, run.name, run.seed, run.budget))  # all there and of the right kind
-    except (ValueError, LookupError, TypeError, ZeroDivisionError) as error:
-        reason = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise UsageError(f"{source}: damaged or foreign: {reason}") from None
+        if (np.diff(run.steps, prepend=0) < 0).any():
+            raise ValueError("evaluations: their steps must never fall")
+        members = run.settings.get("members", 1)
+        if any(len(row[3]) != members or max(row[3]) >= members for row in run.selections):
+            raise ValueError(f"selections: parents must be {members} members")
+    except (ValueError, TypeError, LookupError) as error:
+        raise UsageError(f"{source}: damaged or foreign: {error}") from None
     return run
 
 

@@ -190,7 +190,8 @@ def _pair(comparison: Comparison, task: str, pair: tuple[str, str]) -> list[Grou
 
 
 def _head(figure: Any, text: str) -> None:
-    figure.suptitle(fill(text, int(13 * figure.get_figwidth())), fontsize="small")
+    words = fill(text, int(13 * figure.get_figwidth()))
+    figure.suptitle(words, fontsize="small", parse_math=False)  # a `$` is a word's, not math
 
 
 def svg(figure: Any) -> str:
@@ -234,9 +235,9 @@ def _draw(panel: Any, line: Curve, style: tuple[str, str], label: str) -> None:
 def _label(panel: Any, title: str, x: str, y: str) -> None:
     from matplotlib.ticker import EngFormatter
 
-    panel.set_title(title, fontsize="medium")
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
+    panel.set_title(title, fontsize="medium", parse_math=False)
+    panel.set_xlabel(x, parse_math=False)
+    panel.set_ylabel(y, parse_math=False)
     if not x.startswith("score"):
         panel.xaxis.set_major_formatter(EngFormatter(sep=""))
     panel.grid(alpha=0.3)

@@ -11,6 +11,7 @@ from pacesetter.study.compare.stats import SMOOTHING_ORDER
 from pacesetter.study.report import contents, contrasts, data, paper, tables
 from pacesetter.study.report.headline import headline
 from pacesetter.study.report.tables import Table
+from pacesetter.text import printable
 
 DRAWN = (".pdf", ".png", ".svg")
 SUFFIXES = (".html", ".md", ".tex", ".csv", ".json", *DRAWN)
@@ -48,7 +49,9 @@ def text(comparison: Comparison, options: Options) -> str:
     shown = [contents.overview(comparison), *contrasts.against(comparison)]
     shown += [contents.ledger(comparison.groups)]
     shown += paper.tables(comparison) if options.published else []
-    return "\n\n".join([headline(comparison), tables.plain(shown), *comparison.notes])
+    return "\n\n".join(
+        [headline(comparison), tables.plain(shown), *map(printable, comparison.notes)]
+    )
 
 
 def notebook(comparison: Comparison) -> str:

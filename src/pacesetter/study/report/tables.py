@@ -1,6 +1,6 @@
 """Tables as data, and as plain text, Markdown or LaTeX; each ends in its notes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -8,6 +8,8 @@ import numpy as np
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from pacesetter.study.compare.stats import Interval
+from pacesetter.text import markdown as escaped
+from pacesetter.text import printable
 
 
 class Cell(NamedTuple):
@@ -30,7 +32,7 @@ class Table:
 
 def word(text: object) -> Cell:
     """A cell of words."""
-    return Cell(str(text))
+    return Cell(printable(str(text)))
 
 
 def number(value: float, digits: int = 0, unit: str = "") -> Cell:
@@ -66,11 +68,12 @@ def steps(count: float) -> str:
     return f"{count:,.0f}"
 
 
-def grid(table: Table, form: str) -> str:
-    """Headers and rows alone, in one of tabulate's formats."""
-    rows = [[cell.text for cell in row] for row in table.rows]
+def grid(table: Table, form: str, escape: Callable[[str], str] = printable) -> str:
+    """Headers and rows alone, in one of tabulate's formats, which escapes LaTeX itself."""
+    rows = [[escape(cell.text) for cell in row] for row in table.rows]
+    headers = [escape(header) for header in table.headers]
     sides = ["right" if numeric(table, place) else "left" for place in range(len(table.headers))]
-    return tabulate(rows, table.headers, tablefmt=form, disable_numparse=True, colalign=sides)
+    return tabulate(rows, headers, tablefmt=form, disable_numparse=True, colalign=sides)
 
 
 def numeric(table: Table, place: int) -> bool:
@@ -102,28 +105,28 @@ def plain(tables: Iterable[Table]) -> str:
 
 
 def _plain(table: Table) -> list[str]:
-    lines = [table.title, "", grid(table, "plain")]
-    return lines + ([""] if table.notes else []) + table.notes
+    lines = [printable(table.title), "", grid(table, "plain")]
+    return lines + ([""] if table.notes else []) + [printable(note) for note in table.notes]
 
 
 def markdown(title: str, result: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
     """A page of Markdown, whose first sentence is the result."""
-    parts = [f"# {title}", result, *([_list(notes)] if notes else [])]
+    parts = [f"# {escaped(title)}", escaped(result), *([_list(notes)] if notes else [])]
     for table in tables:
-        parts += [f"## {table.title}", grid(table, "github")]
+        parts += [f"## {escaped(table.title)}", grid(table, "github", escaped)]
         if table.notes:
             parts.append(_list(table.notes))
     return "\n\n".join(parts) + "\n"
 
 
 def _list(lines: Sequence[str]) -> str:
-    return "\n".join(f"- {line}" for line in lines)
+    return "\n".join(f"- {escaped(line)}" for line in lines)
 
 
 def latex(title: str, result: str, notes: Sequence[str], tables: Iterable[Table]) -> str:
     """Tables for `\\input`; needs booktabs and graphicx."""
-    parts = [f"% {title}. Needs \\usepackage{{booktabs,graphicx}}."]
-    parts += [f"% {line}" for line in (result, *notes)]
+    parts = [f"% {printable(title)}. Needs \\usepackage{{booktabs,graphicx}}."]
+    parts += [f"% {printable(line)}" for line in (result, *notes)]
     for table in tables:
         parts += ["\\begin{table}", "\\centering", f"\\caption{{{escape(table.title)}}}"]
         parts.append(_fit(grid(table, "latex_booktabs")))
@@ -146,5 +149,5 @@ def count(value: float) -> Cell:
 
 def escape(text: str) -> str:
     """Words as LaTeX."""
-    escaped = "".join(LATEX_ESCAPE_RULES.get(letter, letter) for letter in text)
-    return escaped.replace("±", "$\\pm$")
+    plain = "".join(LATEX_ESCAPE_RULES.get(letter, letter) for letter in printable(text))
+    return plain.replace("±", "$\\pm$")

@@ -5,6 +5,7 @@ import json
 from collections.abc import Generator
 from contextlib import contextmanager
 from io import TextIOWrapper
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from pacesetter.errors import UsageError
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import difference, fields_of
 from pacesetter.settings.values import Tune
+from pacesetter.storage import FAULTS
 
 try:
     import optuna
@@ -48,14 +50,7 @@ def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) 
     A trial is pruned if it is below the median after `patience` reports. Raises UsageError if the
     file holds a study with other settings.
     """
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    study = optuna.create_study(
-        storage=JournalStorage(JournalFileBackend(str(file))),
-        study_name="pacesetter",
-        direction="maximize",
-        pruner=optuna.pruners.MedianPruner(n_warmup_steps=patience),
-        load_if_exists=True,
-    )
+    study = _read(file, patience)
     about = settings | {f"range of {name}": mark for name, mark in searched.items()}
     new: Settings = json.loads(json.dumps(about))
     old = study.user_attrs.get("about")
@@ -69,6 +64,38 @@ def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) 
     return study
 
 
+def _read(file: Path, patience: int) -> optuna.Study:
+    """The study of a journal, all of which Optuna reads here and takes as it comes."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        study = optuna.create_study(
+            storage=JournalStorage(JournalFileBackend(str(file))),
+            study_name="pacesetter",
+            direction="maximize",
+            pruner=optuna.pruners.MedianPruner(n_warmup_steps=patience),
+            load_if_exists=True,
+        )
+        _refuse_odd(study)
+    except (*FAULTS, AssertionError, RuntimeError) as error:
+        why = f"{type(error).__name__}: {error}"
+        raise UsageError(f"study: {file} is damaged: {why}; give another --study") from None
+    return study
+
+
+def _refuse_odd(study: optuna.Study) -> None:
+    """A ValueError for what no worker of ours has written."""
+    if study.direction != optuna.study.StudyDirection.MAXIMIZE:
+        raise ValueError("it does not maximize")
+    if not isinstance(study.user_attrs.get("about", {}), dict):
+        raise ValueError("its settings are no table")
+    for trial in study.get_trials(deepcopy=False):
+        complete = trial.state == optuna.trial.TrialState.COMPLETE
+        scores = [*trial.intermediate_values.values(), *([trial.value] if complete else [])]
+        numbers = [*trial.params.values(), *scores]
+        if not all(isinstance(number, (int, float)) and isfinite(number) for number in numbers):
+            raise ValueError(f"trial {trial.number} has odd numbers: {numbers}")
+
+
 def refuse_foreign(file: Path) -> None:
     """Refuse a file that is not a journal, to which Optuna would write all the same."""
     try:
@@ -78,7 +105,7 @@ def refuse_foreign(file: Path) -> None:
             raise ValueError("not a journal of Optuna")
     except FileNotFoundError:
         pass
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, RecursionError) as error:
         raise UsageError(f"study: {file} is not a study: {error}") from None
 
 

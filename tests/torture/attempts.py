@@ -1,0 +1,156 @@
+"""One command on one odd input, in this process: how it ended, how long it took, what it ran."""
+
+import io
+import resource
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pacesetter.cli.main import main
+from pacesetter.errors import TrainingError, UsageError
+
+SECONDS = 1.0  # of the processor, that one attempt may take
+MEGABYTES = 100  # that all attempts of an experiment may add
+# What a file must never make a command do; git is asked for the commit.
+ALARMS = ("os.system", "os.exec", "os.posix_spawn", "pickle.find_class", "socket.connect")
+INTRUDER = "intruder"
+
+_ran: list[str] = []
+
+
+def _listen(event: str, arguments: tuple[Any, ...]) -> None:
+    if (
+        event in ALARMS
+        or (event == "import" and str(arguments[0]).split(".")[0] == INTRUDER)
+        or (event == "subprocess.Popen" and "git" not in str(arguments[0]))
+    ):
+        _ran.append(f"{event} {arguments[0]!r}")
+
+
+sys.addaudithook(_listen)
+
+
+@dataclass
+class Tally:
+    """Attempts so far, and what was wrong with each that was."""
+
+    made: int = 0
+    refused: int = 0
+    slowest: float = 0.0
+    wrong: list[str] = field(default_factory=list[str])
+    before: int = field(default_factory=lambda: _peak())
+
+    @property
+    def megabytes(self) -> float:
+        """By how much the peak of this process's memory has grown."""
+        return (_peak() - self.before) / 1024
+
+    def table(self) -> str:
+        """As the table of docs/reliability.md says it."""
+        kinds = {
+            kind: sum(kind in each for each in self.wrong) for kind in ("traceback", "code run")
+        }
+        others = len(self.wrong) - sum(kinds.values())
+        said = ", ".join(
+            f"{count} {kind}s" if kind == "traceback" else f"{count} {kind}"
+            for kind, count in kinds.items()
+        )
+        return (
+            f"{self.made:,} files, {self.refused:,} refused: {said}, {others} other faults; "
+            f"{self.megabytes:.0f} MB, {self.slowest:.2f} s at most"
+        )
+
+
+def _peak() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB
+
+
+def attempt(tally: Tally, about: str, action: Callable[[], Any]) -> None:
+    """Do one thing that may only succeed, or be refused in one line."""
+    _ran.clear()
+    began = time.thread_time()
+    fault = ""
+    try:
+        action()
+    except (UsageError, TrainingError) as error:
+        tally.refused += 1
+        fault = "" if str(error).isprintable() else f"unprintable: {error!r}"
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        fault = f"traceback: {type(error).__name__}: {error!s:.80} ({where.name}, {where.lineno})"
+    spent = time.thread_time() - began
+    tally.made += 1
+    tally.slowest = max(tally.slowest, spent)
+    if _ran:
+        fault = f"code run: {_ran[0]}"
+    elif spent > SECONDS and not fault:
+        fault = f"slow: {spent:.1f} s"
+    if fault:
+        tally.wrong.append(f"{about}: {fault}")
+
+
+def command(*words: object) -> Callable[[], None]:
+    """A command line as an action: it raises what a person would see as a refusal."""
+
+    def act() -> None:
+        out, err = _stream(), _stream()
+        with redirect_stdout(out), redirect_stderr(err):
+            try:
+                code = main([str(word) for word in words])
+            except SystemExit as end:
+                code = int(end.code or 0)
+        said, lines = _text(err), _text(err).strip("\n").split("\n")
+        if code:
+            _check_refusal(code, said, lines)
+            raise UsageError(lines[-1])
+        _check_escapes(_text(out))
+
+    return act
+
+
+def _check_refusal(code: int, said: str, lines: list[str]) -> None:
+    if code not in (1, 2, 75) or len(lines) > 3 or not lines[-1].startswith("pacesetter: "):
+        raise AssertionError(f"exit {code} without one line: {said[-200:]!r}")
+    _check_escapes(said)
+
+
+def _check_escapes(text: str) -> None:
+    if any(not (letter.isprintable() or letter in "\n\t\r") for letter in text):
+        raise AssertionError(f"control characters reach the terminal: {text!r:.200}")
+
+
+def _stream() -> io.TextIOWrapper:
+    return io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace")
+
+
+def _text(stream: io.TextIOWrapper) -> str:
+    stream.flush()
+    buffer: Any = stream.buffer
+    return buffer.getvalue().decode("utf-8", "backslashreplace")
+
+
+@contextmanager
+def trap(folder: Path) -> Iterator[None]:
+    """A folder in which a module lies in wait that no file may have imported."""
+    (folder / f"{INTRUDER}.py").write_text("raise SystemExit('the intruder ran')\n")
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+
+
+@contextmanager
+def patched(holder: Any, name: str, value: Any) -> Iterator[None]:
+    """An attribute replaced for a while."""
+    before = getattr(holder, name)
+    setattr(holder, name, value)
+    try:
+        yield
+    finally:
+        setattr(holder, name, before)
