@@ -36,6 +36,10 @@ class TrainingError(_OneLine):
     """A run that cannot continue, such as one with a NaN; its last good checkpoint is kept."""
 
 
+class TaskError(TrainingError):
+    """A fault of the task: it raised, exited, or gave what it must not."""
+
+
 def reason(error: BaseException) -> str:
     """Why something failed, by the exception of code that is not ours: its kind and whole text.
 
@@ -88,4 +92,4 @@ class blame:  # noqa: N801 (a context manager reads as a verb)
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         if isinstance(error, TrainingError):
-            raise TrainingError(f"{self.where}: {error}") from error
+            raise type(error)(f"{self.where}: {error}") from error

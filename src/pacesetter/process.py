@@ -24,6 +24,7 @@ KEPT = {
     "JAX_CUDA_VISIBLE_DEVICES",
     "JAX_ROCM_VISIBLE_DEVICES",
 }
+_exit = os._exit  # which is another while a task is called
 Handler = Callable[[int, FrameType | None], None]
 
 
@@ -71,12 +72,18 @@ def forget_jax_settings() -> list[str]:
 
 def leave(number: int, frame: FrameType | None) -> None:
     """End at once and without a word: nothing has begun."""
-    os._exit(CODES[number])
+    _exit(CODES[number])
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
     """End by an exception, so that files and helpers are closed on the way out."""
     raise Interrupted(number)
+
+
+def is_signal(error: BaseException) -> bool:
+    """Whether a signal raised this, not code that raises KeyboardInterrupt by itself."""
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return isinstance(error, Interrupted) or (isinstance(error, KeyboardInterrupt) and raises)
 
 
 def on_signals(handler: Handler) -> None:
@@ -104,7 +111,7 @@ def stopping(
     def handle(number: int, frame: FrameType | None) -> None:
         if received:
             abandon()
-            os._exit(CODES[number])
+            _exit(CODES[number])
         received.append(number)
         stop()
 

@@ -439,7 +439,7 @@ def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
     """The sums of the log's own rows, one an iteration."""
     trainer = Trainer("me-trpo", "Hopper-v5", runs=tmp_path, steps=750, **RUN)
     searched = fitted = 0.0
-    while not trainer.finished:
+    while trainer.progress.step < trainer.budget:
         trainer.loop.tick()
         told = trainer.loop.training_values()
         searched += told["policy_updates"]

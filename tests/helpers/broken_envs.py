@@ -3,6 +3,10 @@
 They are named `broken_envs:NAME-v0`, as tasks of any other package are.
 """
 
+import os
+import sys
+import time
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
@@ -178,6 +182,22 @@ class Endless(Probe):
         return observation, reward, False, False, {}
 
 
+class Hangs(Probe):
+    """Never comes back from its 150th step, and makes a file there."""
+
+    def __init__(self, mark: str) -> None:
+        super().__init__()
+        self.mark, self.life = mark, 0
+
+    def step(self, action: Any) -> Any:
+        self.life += 1
+        if self.life == 150:
+            Path(self.mark).touch()
+            while True:
+                time.sleep(1)
+        return super().step(action)
+
+
 class Ageing(Probe):
     """Pays more in every episode of its life, which no seed and no observation tells."""
 
@@ -235,6 +255,12 @@ class Late(Probe):
             return np.float32([0, 0, NAN]), *result[1:]
         if self.fault == "reward":
             return result[0], float("-inf"), *result[2:]
+        if self.fault == "exit":
+            sys.exit(0)
+        if self.fault == "os._exit":
+            os._exit(0)
+        if self.fault == "interrupt":
+            raise KeyboardInterrupt
         raise RuntimeError("a bolt fell out\nat the left knee")
 
 

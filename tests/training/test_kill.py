@@ -29,7 +29,9 @@ from stopping import (
 
 from pacesetter import storage
 from pacesetter.cli.main import main
-from pacesetter.errors import TrainingError
+from pacesetter.errors import TaskError, TrainingError
+from pacesetter.policy import Policy
+from pacesetter.process import stopping
 from pacesetter.replay import buffer
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.training.trainer import Trainer
@@ -147,11 +149,14 @@ def test_signal_before_there_is_a_run(number: signal.Signals, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> None:
-    """The first waits for a long evaluation to end, the second for nothing; resume goes on."""
-    words = ["train", "td3", "HalfCheetah-v5", "--steps", "500", *FLAGS]
-    process = launch([*words, "--eval-episodes", "10000"], tmp_path)
-    wait_for(partial(training, tmp_path), process)
+def test_second_signal_ends_at_once(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first waits for a task that hangs, the second for nothing; resume goes on."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(broken_envs.__file__).parent))
+    words = ["train", "td3", "broken_envs:Hangs-v0", "--steps", "500", *FLAGS]
+    process = launch([*words, f"--env.mark={tmp_path / 'mark'}"], tmp_path)
+    wait_for((tmp_path / "mark").exists, process)
     process.send_signal(number)
     time.sleep(0.5)
     assert process.poll() is None
@@ -167,12 +172,43 @@ def test_second_signal_ends_at_once(number: signal.Signals, tmp_path: Path) -> N
     trainer.close()
 
 
+def stopping_act(trainer: Trainer, at: int) -> Callable[[Policy, Any], Any]:
+    """`Policy.act`, which asks for the end within an evaluation: as the mean actions are played."""
+    act, calls = Policy.act, 0
+
+    def act_and_count(self: Policy, observation: Any) -> Any:
+        nonlocal calls
+        calls += trainer.progress.step == at
+        if calls == 250:  # the champion's trial took the first hundred
+            trainer.stop()
+        return act(self, observation)
+
+    return act_and_count
+
+
+def test_stop_within_an_evaluation(tmp_path: Path) -> None:
+    """It is given up at once, however long it is; the resumed run makes it, and all else once."""
+    settings: dict[str, Any] = {"eval_every": 300, "mean_actions": "on", "snapshots": 2}
+    whole = run_to_end(late(tmp_path / "whole", **settings))
+    trainer = late(tmp_path / "stopped", **settings)
+    for at in (0, 300, 900):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Policy, "act", stopping_act(trainer, at))
+            run_to_end(trainer)
+        assert (trainer.progress.step, trainer.finished) == (at, False)
+        trainer = Trainer.resume(trainer.directory.path)
+    assert_same(whole, run_to_end(trainer))
+
+
 # Faults at a late step.
 
 FAULTS = {
     "nan": "observation: must be finite, number 2 is nan",
     "reward": "reward: must be finite in float32, got -inf",
     "error": "a bolt fell out",
+    "exit": "step: failed: SystemExit: 0",
+    "os._exit": r"step: failed: SystemExit: os._exit\(0\)",
+    "interrupt": "step: failed: KeyboardInterrupt",
 }
 
 
@@ -204,15 +240,18 @@ def test_fault_of_env_stops_the_run(
     disarmed: None,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """One line names member and step; without the fault the run goes on as if it had not been."""
+    """One line names member and step, and all before is saved; without the fault the run goes on
+    as if it had not been.
+    """
     # Member 1 acts second in each tick; its own 300th step comes when the run has made 599.
     Late.arm(fault, victim=1, at=300)
     trainer = late(tmp_path / "faulty")
-    with pytest.raises(TrainingError, match=f"member 1, step 599: .*{FAULTS[fault]}"):
+    fails = pytest.raises(TaskError, match=f"member 1, step 599: .*{FAULTS[fault]}")
+    with stopping(trainer.stop), fails:  # else pytest has KeyboardInterrupt
         run_to_end(trainer)
     directory = trainer.directory
     assert not directory.in_use()
-    assert 0 < saved_step(directory) < 600
+    assert saved_step(directory) == 599  # within a tick, so only after the fault
     Late.arm(fault, victim=1, at=saved_step(directory) // 2 % broken_envs.EPISODE + 5)
     assert main(["resume", str(directory.path), "-q"]) == 1
     kept, error = capsys.readouterr().err.splitlines()
@@ -224,12 +263,16 @@ def test_fault_of_env_stops_the_run(
 
 
 def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:
-    """The env of evaluations is number 2."""
-    Late.arm("nan", victim=2, at=150)
-    trainer = late(tmp_path, eval_every=300)
-    with pytest.raises(TrainingError, match=r"member \d, step 300: .*observation"):
+    """The env of evaluations is number 2; the resumed run makes the evaluation again."""
+    whole = run_to_end(late(tmp_path / "whole", eval_every=300, checkpoint_every=3600))
+    Late.arm("nan", victim=2, at=150 + 3 * broken_envs.EPISODE)
+    trainer = late(tmp_path / "faulty", eval_every=300, checkpoint_every=3600)
+    with pytest.raises(TaskError, match=r"member \d, step 300: .*observation"):
         run_to_end(trainer)
     assert not trainer.directory.in_use()
+    assert saved_step(trainer.directory) == 300
+    Late.disarm()
+    assert_same(whole, run_to_end(Trainer.resume(trainer.directory.path)))
 
 
 def poison(trainer: Trainer, field: str, member: int, value: float) -> None:

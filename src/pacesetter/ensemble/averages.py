@@ -51,7 +51,7 @@ class Averages:
     def policies(
         self, champion: Policy, members: Sequence[Policy], now: Sequence[Policy]
     ) -> dict[str, list[Policy]]:
-        """Policies to average by name; the champion joins the snapshots.
+        """Policies to average by name; the champion is one of the snapshots.
 
         `members` are their policies, and `now` the same without regard to any assessment.
         """
@@ -65,10 +65,14 @@ class Averages:
                 for policy, ema in pairs
             ]
         if self.run.snapshots:
+            found["snapshots"] = [*self.snapshots, champion][-self.run.snapshots :]
+        return found
+
+    def keep_snapshot(self, champion: Policy) -> None:
+        """Let the champion of an evaluation that is made join the snapshots."""
+        if self.run.snapshots:
             self.snapshots.append(replace(champion, about={}))
             del self.snapshots[: -self.run.snapshots]
-            found["snapshots"] = list(self.snapshots)
-        return found
 
     def arrays(self) -> Arrays:
         return flatten({"ema": self.ema, "snapshots": [_parts(each) for each in self.snapshots]})

@@ -45,6 +45,7 @@ class Explorer:
         self.starting = True  # the next tick begins an episode
         self.active = True  # False while it waits for other members to end their episodes
         self.started = 0  # step of the run at which the episode began
+        self.pending: Floats | None = None  # an action that was chosen and not yet made
 
     def start(self, params: Any, step: int) -> None:
         """Begin an episode at a step of the run."""
@@ -68,9 +69,10 @@ class Explorer:
         """Step the env with the clipped action; the transition holds it clipped or as it is."""
         if not np.isfinite(action).all():
             raise TrainingError(f"action is not finite: {action}")
-        env, sent = self.env, clip(action)
+        env, sent, self.pending = self.env, clip(action), action
         before, earned = env.observation, env.earned
         step = env.step(sent)
+        self.pending = None
         self.active = not step.ended
         return Transition(
             observation=before,
@@ -93,7 +95,8 @@ class Explorer:
         if not self._running:
             actions, observation = actions[:0], np.zeros_like(observation)
         noise = flatten({"noise_state": self.noise_state})
-        return {"actions": actions, "observation": observation, **noise}
+        pending = {} if self.pending is None else {"pending": self.pending}
+        return {"actions": actions, "observation": observation, **noise, **pending}
 
     def table(self) -> dict[str, Any]:
         return {
@@ -114,7 +117,7 @@ class Explorer:
             stream.bit_generator.state = state
         self.noise_state = rebuild({"noise_state": self.noise_state}, arrays)["noise_state"]
         self.starting, self.active = table["starting"], table["active"]
-        self.started = table["started"]
+        self.started, self.pending = table["started"], arrays.get("pending")
         snapshot = Snapshot(table["episode"], arrays["actions"], arrays["observation"])
         if not self._running:
             self.env.episode = snapshot.episode

@@ -29,6 +29,7 @@ class Loop(Protocol):
 
     progress: Progress
     learners: Learners
+    whole: bool  # whether a checkpoint made now, after a fault of the task, would go on exactly
     budget: int  # env steps in all, of every member and, where it is counted, of selection
 
     @property
@@ -53,6 +54,10 @@ class Loop(Protocol):
 
     def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
         """Policies whose mean action is evaluated beside the champion's, by name."""
+        ...
+
+    def keep_snapshot(self, champion: Policy) -> None:
+        """Let the champion of an evaluation that is made join the snapshots."""
         ...
 
     def training_values(self) -> dict[str, Any]:

@@ -58,6 +58,7 @@ class Members:
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
         self.averages = Averages(run, self.learners, self.current_policy(0))
         self.progress = Progress.of(run.members, spread(run, hyper, run.seed))
+        self.whole = True
 
     def open_replays(self, folder: Path) -> None:
         """Make or find the rings."""
@@ -68,9 +69,11 @@ class Members:
     def tick(self) -> Selection | None:
         """One tick; the selection, if it made one."""
         self.collect()
+        self.whole = False
         self.learn()
         selection = self.end_round()
         self.progress.tick += 1
+        self.whole = True
         return selection
 
     def close(self) -> None:
@@ -88,10 +91,14 @@ class Members:
         return self.policy_checkpoints.policy(member) or self.current_policy(member)
 
     def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
-        """Policies whose mean action is evaluated beside the champion's; it joins the snapshots."""
+        """Policies whose mean action is evaluated beside the champion's."""
         members = range(self.config.run.members)
         now = [self.current_policy(k) for k in members]
         return self.averages.policies(champion, [self.policy(k) for k in members], now)
+
+    def keep_snapshot(self, champion: Policy) -> None:
+        """Let the champion of an evaluation that is made join the snapshots."""
+        self.averages.keep_snapshot(champion)
 
     def current_policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
@@ -105,16 +112,27 @@ class Members:
     # Collect: i is the number of an env, k that of its member.
 
     def collect(self) -> None:
-        """Every env acts whose episode runs and whose member has no updates due."""
+        """Every env acts whose episode runs and whose member has no updates due.
+
+        Where a task's fault broke it off, it goes on with the action that was not made.
+        """
+        progress, members = self.progress, self.config.run.members
+        if not progress.acting:
+            self._begin_collecting()
+        while progress.acting:
+            i = progress.acting[0]
+            with blame(i % members, progress.step):
+                self._step(i)
+            del progress.acting[0]
+
+    def _begin_collecting(self) -> None:
         progress, members = self.progress, self.config.run.members
         for i, explorer in enumerate(self.explorers):
             if explorer.starting:
                 self._start_episode(i)
         due = [self._updates_due(k) for k in range(members)]
         acting = [i for i, e in enumerate(self.explorers) if e.active and not due[i % members]]
-        for i in acting[: self.budget - progress.step]:
-            with blame(i % members, progress.step):
-                self._step(i)
+        progress.acting = acting[: self.budget - progress.step]
 
     def _start_episode(self, i: int) -> None:
         k = i % self.config.run.members
@@ -129,7 +147,9 @@ class Members:
         hyper, progress, explorer = self.config.hyper, self.progress, self.explorers[i]
         k = i % self.config.run.members
         member = progress.members[k]
-        if progress.step < hyper.warmup:
+        if explorer.pending is not None:
+            action = explorer.pending
+        elif progress.step < hyper.warmup:
             action = explorer.random_action()
         else:
             seen = self.normalizer.scale(explorer.env.observation)

@@ -38,6 +38,8 @@ class Progress:
 
     members: list[Member]
     tick: Natural = 0
+    # Envs that a tick which the task broke off has still to step.
+    acting: list[Natural] = field(default_factory=list[int])
     selection_steps: Natural = 0
     free_steps: Natural = 0  # of selection, those that the budget does not count
     updates: Natural = 0

@@ -7,9 +7,10 @@ import numpy as np
 
 from pacesetter.envs import border
 from pacesetter.envs.border import Step
+from pacesetter.envs.calls import call
 from pacesetter.envs.spaces import action_bounds
 from pacesetter.envs.tasks import Recipe
-from pacesetter.errors import TrainingError, UsageError, reason
+from pacesetter.errors import TaskError, UsageError
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.types import Floats
@@ -53,13 +54,12 @@ class Environment:
 
     def reset(self, episode: int | None = None) -> Floats:
         """Start an episode by its number, by default the next one."""
-        self.episode = self.episode + 1 if episode is None else episode
-        self.actions, self.earned = [], 0.0
+        episode = self.episode + 1 if episode is None else episode
         if self.recipe.renew and not self.new:
             self.close()
             self.env = self._call("episode", self.recipe.make)
         self.new = False
-        seed = episode_seed(self.seed, self.stream, self.index, self.episode)
+        seed = episode_seed(self.seed, self.stream, self.index, episode)
         result: Any = self._call("reset", self.env.reset, seed=seed)
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._broken("reset: must return (observation, info)")
@@ -68,14 +68,14 @@ class Environment:
         except ValueError as error:
             raise self._broken(error) from None
         self.given = result[0]
+        self.episode, self.actions, self.earned = episode, [], 0.0
         return self.observation
 
     def step(self, action: Floats) -> Step:
-        """One step with an action (A,) in [-1, 1]."""
+        """One step with an action (A,) in [-1, 1]; after a fault the episode is as before it."""
         if len(self.actions) >= MAX_EPISODE:
             why = f"has not ended after {MAX_EPISODE:,} steps; give the task a limit, such as"
             raise self._broken(f"episode: {why} --env.max_episode_steps 1000")
-        self.actions.append(action)
         scaled = to_env(action, self.low, self.high)
         scaled = scaled.reshape(self.action_shape).astype(self.action_type)
         result: Any = self._call("step", self.env.step, scaled)
@@ -85,6 +85,7 @@ class Environment:
             raise self._broken(error) from None
         self.given, self.paid = result[0], result[1:4]
         self.observation = step.observation
+        self.actions.append(action)
         self.earned += step.reward
         return step
 
@@ -95,7 +96,7 @@ class Environment:
             self.reset(0)
             notes = [*border.notes_on_observation(self.given, space)]
             self.step(np.zeros(self.action_size, np.float32))
-        except TrainingError as error:
+        except TaskError as error:
             raise UsageError(f"env: {error}") from None
         notes += [*border.notes_on_observation(self.given, space), *border.notes_on_step(self.paid)]
         self.episode = -1
@@ -121,10 +122,7 @@ class Environment:
         self._call("close", self.env.close)
 
     def _call(self, what: str, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
-        try:
-            return function(*given, **named)
-        except Exception as error:
-            raise self._broken(f"{what}: failed: {reason(error)}") from error
+        return call(f"{self.name}: {what}: failed", function, *given, **named)
 
-    def _broken(self, why: object) -> TrainingError:
-        return TrainingError(f"{self.name}: {why}")
+    def _broken(self, why: object) -> TaskError:
+        return TaskError(f"{self.name}: {why}")

@@ -8,8 +8,9 @@ from typing import Any
 
 import gymnasium
 
+from pacesetter.envs.calls import call
 from pacesetter.envs.spaces import check_spaces
-from pacesetter.errors import UsageError, reason, unknown
+from pacesetter.errors import TaskError, UsageError, unknown
 from pacesetter.settings import Settings
 
 
@@ -50,9 +51,9 @@ class Recipe:
         """A new env. Raises UsageError if the id or the task is wrong."""
         _refuse_unknown(self.name)
         try:
-            env = make_quietly(self.name, self.kwargs)
-        except Exception as error:
-            raise UsageError(f"env: cannot make '{self.name}': {reason(error)}") from None
+            env = call(f"env: cannot make '{self.name}'", make_quietly, self.name, self.kwargs)
+        except TaskError as error:
+            raise UsageError(str(error)) from None
         check_spaces(self.name, env)
         return env
 

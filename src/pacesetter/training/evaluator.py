@@ -14,6 +14,11 @@ from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
+from pacesetter.types import Floats
+
+
+class Stopped(Exception):  # noqa: N818 (it is no error)
+    """An evaluation was given up; a resumed run makes it."""
 
 
 class Evaluator:
@@ -22,6 +27,7 @@ class Evaluator:
     def __init__(self, loop: Loop, config: Config, directory: RunDirectory, recipe: Recipe) -> None:
         self.loop, self.config, self.directory, self.recipe = loop, config, directory, recipe
         self._env: Environment | None = None
+        self._stopping = False
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
@@ -34,11 +40,13 @@ class Evaluator:
         return policy
 
     def evaluate(self, ending: bool) -> dict[str, Any]:
-        """Evaluate the champion and write its policy files; the values of a row of the log."""
+        """Evaluate the champion and write its policy files; the values of a row of the log.
+
+        Nothing changes before all is played. Raises Stopped after `stop`.
+        """
         run, progress = self.config.run, self.loop.progress
         policy = self.policy()
         trial = self._trial(policy.act, progress.champion)
-        self._save(policy, trial)
         values = trial.table() | {"champion": progress.champion}
         if means := self._mean_actions(policy):
             values["mean_actions"] = means
@@ -48,7 +56,13 @@ class Evaluator:
         if ending and run.rule == "none" and run.members > 1:
             members = range(run.members)
             values["members"] = [self._trial(self.policy(k).act, k).mean for k in members]
+        self._save(policy, trial)
+        self.loop.keep_snapshot(policy)
         return values
+
+    def stop(self) -> None:
+        """Give up the evaluation that is being made, and make no other."""
+        self._stopping = True
 
     def close(self) -> None:
         """Let go of the env."""
@@ -80,7 +94,14 @@ class Evaluator:
         if self._env is None:
             self._env = Environment(self.recipe, run.seed, Stream.EVALUATE)
         with blame(member, self.loop.progress.step):
-            return rollouts(act, self._env, run.eval_episodes)
+            return rollouts(
+                lambda observation: self._act(act, observation), self._env, run.eval_episodes
+            )
+
+    def _act(self, act: Act, observation: Floats) -> Floats:
+        if self._stopping:
+            raise Stopped
+        return act(observation)
 
 
 def _keep(policy: Policy, folder: Path, step: int, most: int) -> None:

@@ -35,6 +35,7 @@ class OnPolicyLoop:
     """One learner that explores several envs: the `Loop` of on-policy learning."""
 
     has_due_updates = False  # an iteration makes its update
+    whole = True
 
     def __init__(self, config: Config, envs: list[Environment]) -> None:
         run, hyper, first = config.run, config.hyper, envs[0]
@@ -66,11 +67,13 @@ class OnPolicyLoop:
     def tick(self) -> None:
         """One iteration; what is left of the budget at the end is too little to learn from."""
         size = self.config.hyper.rollout_length * len(self.explorers)
+        self.whole = False
         rows = self.collect(min(size, self.budget - self.progress.step))
         self.source.keep(rows)
         if len(rows) == size:
             self.learn(rows)
         self.progress.tick += 1
+        self.whole = True
 
     def close(self) -> None:
         """Let go of envs, files and threads."""
@@ -90,6 +93,9 @@ class OnPolicyLoop:
     def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
         """None: there is one member."""
         return {}
+
+    def keep_snapshot(self, champion: Policy) -> None:
+        """There is nothing to keep."""
 
     def collect(self, steps: int) -> Floats:
         """Rows (steps, width) of that many steps, the envs in turn."""

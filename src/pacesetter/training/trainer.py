@@ -1,6 +1,7 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
@@ -11,7 +12,7 @@ from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment, apart
 from pacesetter.envs.apart import Apart
-from pacesetter.errors import TrainingError, UsageError
+from pacesetter.errors import TaskError, TrainingError, UsageError
 from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
@@ -21,7 +22,7 @@ from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import is_reached, out_of_time
 from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint
-from pacesetter.training.evaluator import Evaluator
+from pacesetter.training.evaluator import Evaluator, Stopped
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
 from pacesetter.training.starting import start_from
@@ -161,7 +162,7 @@ class Trainer:
         try:
             while True:
                 self._clock.tell(self.progress)
-                ending = self.finished
+                ending = self._spent
                 self._report_what_is_due(ending)
                 reports, self._reports = self._reports, []
                 yield from reports
@@ -175,6 +176,9 @@ class Trainer:
             self.save()
         except GeneratorExit:
             self.save()
+            raise
+        except TaskError:
+            self._save_if_whole()
             raise
         except OSError as error:
             where = f"step {self.progress.step}: {self.directory.path}"
@@ -194,6 +198,11 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
+        """Whether the budget is spent and the last policy evaluated."""
+        return self._spent and self.progress.last_evaluation == self.progress.step
+
+    @property
+    def _spent(self) -> bool:
         """Whether the budget of steps, with the updates that are due, or of time is spent."""
         out = out_of_time(vars(self.config.run), self.progress.wall_seconds)
         if out or self._reached:
@@ -205,8 +214,11 @@ class Trainer:
         return is_reached(vars(self.config.run), self.progress.best)
 
     def stop(self) -> None:
-        """Ask for the end after the running tick; may be called from a signal handler."""
+        """Ask for the end after the running tick, or within an evaluation, which a resumed run
+        makes again; may be called from a signal handler.
+        """
         self._stopping = True
+        self._evaluator.stop()
 
     def save(self) -> None:
         """Write a checkpoint now."""
@@ -214,6 +226,12 @@ class Trainer:
         self._clock.tell(self.progress)
         checkpoint.save(self.loop, self.config, self.directory)
         self._saved_at = self.progress.wall_seconds
+
+    def _save_if_whole(self) -> None:
+        """After a fault of the task, whose error is the one to be seen."""
+        if self.loop.whole:
+            with suppress(TrainingError, OSError):
+                self.save()
 
     def close(self) -> None:
         """Let go of envs, files and the folder."""
@@ -251,7 +269,11 @@ class Trainer:
         last = ending and progress.last_evaluation < progress.step
         # The last one waits for all updates that the budget's last steps made due.
         if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
-            self._emit("eval", self._evaluator.evaluate(ending))
+            try:
+                values = self._evaluator.evaluate(ending)
+            except Stopped:
+                return
+            self._emit("eval", values)
             every = self.config.run.eval_every * self.config.steps_per_count
             progress.last_evaluation = progress.step
             progress.next_evaluation = (progress.step // every + 1) * every
