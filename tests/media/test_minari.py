@@ -77,7 +77,7 @@ def test_a_fall_is_a_termination_and_nothing_else_is_left(tmp_path: Path) -> Non
     [
         ("pendulum", {}, "must end in a name and a version, such as cheetah-v0"),
         ("there-v0", {}, "exists; give another name"),
-        ("none/pendulum-v0", {}, "cannot write"),
+        ("none/pendulum-v0", {}, "make the folder .*none first"),
         ("pendulum-v0", {"episodes": 0}, "episodes: must be at least 1, got 0"),
     ],
 )

@@ -86,7 +86,7 @@ def _check(path: Path, episodes: int) -> None:
     if path.exists():
         raise UsageError(f"minari: {path} exists; give another name or version")
     if not path.parent.is_dir():
-        raise UsageError(f"minari: cannot write {path}: No such file or directory")
+        raise UsageError(f"minari: cannot write {path}: make the folder {path.parent} first")
     if episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
 
