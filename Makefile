@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-slow check docs wheel bench-speed clean
+.PHONY: demo test test-slow torture torture-long check docs wheel bench-speed clean
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -26,6 +26,12 @@ test: .venv/tested
 test-slow: .venv/tested
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[scale]'
 	$(BIN)/pytest -m slow
+
+torture: .venv/tested
+	$(BIN)/python tests/torture/run.py
+
+torture-long: .venv/tested
+	$(BIN)/python tests/torture/run.py --long
 
 check: .venv/tested
 	$(BIN)/ruff check .

@@ -50,19 +50,19 @@ class Tally:
         """By how much the peak of this process's memory has grown."""
         return (_peak() - self.before) / 1024
 
+    @property
+    def passed(self) -> bool:
+        """Whether the targets are met."""
+        return not self.wrong and self.megabytes < MEGABYTES
+
     def table(self) -> str:
         """As the table of docs/reliability.md says it."""
-        kinds = {
-            kind: sum(kind in each for each in self.wrong) for kind in ("traceback", "code run")
-        }
-        others = len(self.wrong) - sum(kinds.values())
-        said = ", ".join(
-            f"{count} {kind}s" if kind == "traceback" else f"{count} {kind}"
-            for kind, count in kinds.items()
-        )
+        tracebacks = sum(": traceback" in each for each in self.wrong)
+        ran = sum(": code run" in each for each in self.wrong)
         return (
-            f"{self.made:,} files, {self.refused:,} refused: {said}, {others} other faults; "
-            f"{self.megabytes:.0f} MB, {self.slowest:.2f} s at most"
+            f"{self.made:,} made, {self.refused:,} refused in one line; {tracebacks} tracebacks, "
+            f"{ran} code run, {len(self.wrong) - tracebacks - ran} other faults; "
+            f"{self.megabytes:.0f} MB more, {self.slowest:.2f} CPU seconds at most"
         )
 
 

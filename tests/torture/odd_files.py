@@ -172,7 +172,7 @@ def _made_study(folder: Path) -> bytes:
     return (folder / "study.log").read_bytes()
 
 
-def _no_further(device: str) -> None:
+def no_further(device: str) -> None:
     raise UsageError("settings are fine; nothing is trained here")
 
 
@@ -190,7 +190,7 @@ def run(folder: Path, kinds: Iterable[str], each: int, seed: int = 0) -> Tally:
         for kind in kinds:
             path, spoil, readers = found[kind]
             no_training = kind == "settings.toml"
-            fake = _no_further if no_training else trainer.prepare
+            fake = no_further if no_training else trainer.prepare
             with patched(trainer, "prepare", fake):
                 for number in range(each):
                     path.write_bytes(spoil(base.bytes_of(path), rng))

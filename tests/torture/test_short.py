@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import configurations
 import odd_files
 import pytest
+import swapped
 from attempts import Tally, attempt, command
 
 
@@ -13,6 +15,20 @@ def test_odd_files(tmp_path: Path) -> None:
     assert tally.wrong == []
     assert tally.made == 12 * len(odd_files.KINDS)
     assert tally.refused > tally.made / 4
+
+
+@pytest.mark.filterwarnings("default")
+def test_configurations(tmp_path: Path) -> None:
+    tally = configurations.run(tmp_path, 60, seed=5)
+    assert tally.wrong == []
+    assert tally.made == tally.refused == 60
+
+
+@pytest.mark.filterwarnings("default")
+def test_files_that_are_no_longer_what_they_were(tmp_path: Path) -> None:
+    tally = swapped.run(tmp_path, 25, seed=5)
+    assert tally.wrong == []
+    assert 0 < tally.refused < tally.made == 25
 
 
 def test_an_attempt_sees_what_goes_wrong(tmp_path: Path) -> None:

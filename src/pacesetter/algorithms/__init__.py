@@ -60,6 +60,6 @@ def find(name: str) -> type[Any]:
         learner: Any = getattr(import_module(path), attribute)
         if not isinstance(learner.Hyper, type):
             raise TypeError("its attribute Hyper must be a settings class")
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UsageError(f"algorithm: cannot load '{target}': {error}") from None
     return learner

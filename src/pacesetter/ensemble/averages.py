@@ -5,7 +5,7 @@ actor after each of its updates. Nothing here is ever learned from or acts in tr
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,16 @@ from pacesetter.learner.learners import Learners
 from pacesetter.learner.tree_arrays import below, flatten, rebuild
 from pacesetter.policy import Policy, unstack
 from pacesetter.settings.ensemble import Ensemble
+from pacesetter.settings.validation import Natural, check
 from pacesetter.types import Arrays, Floats
+
+
+@dataclass
+class _Saved:
+    """Averages in a checkpoint: who has an EMA actor, and how many snapshots."""
+
+    ema: list[bool]
+    snapshots: Natural
 
 
 class Averages:
@@ -82,13 +91,16 @@ class Averages:
 
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays` and `table`."""
+        saved = check(_Saved, table)
+        if len(saved.ema) != len(self.ema):
+            raise ValueError(f"EMA actors of {len(saved.ema)} members")
         layers = self.learners.compiled.actors(self.learners.states[0])
         self.ema = [
             rebuild(layers, below(f"ema.{k}", arrays)) if held else None
-            for k, held in enumerate(table["ema"])
+            for k, held in enumerate(saved.ema)
         ]
         self.snapshots = []
-        for i in range(table["snapshots"]):
+        for i in range(saved.snapshots):
             parts = rebuild(_parts(self.like), below(f"snapshots.{i}", arrays))
             self.snapshots.append(replace(self.like, actors=parts[0], normalizer=parts[1]))
 
