@@ -31,6 +31,8 @@ class RunSettings(TypedDict, total=False):
     """earlier run, or policy file, whose networks the members start with"""
     seed: int
     """seed of every random stream"""
+    renew_env: bool | None
+    """make the task anew at each episode, so that none depends on those before it; default..."""
     members: int
     """ensemble members: learners that share the replay"""
     rule: str
@@ -40,7 +42,7 @@ class RunSettings(TypedDict, total=False):
     select_every: int | str
     """env steps between selections, with --select-on eval"""
     select_window: int | None
-    """episodes per member behind each selection; default 1, with --rule rescue 5"""
+    """episodes per member behind each selection; default 1, with rescue or pbt 5"""
     select_after: int | str | None
     """env steps before the first selection; default --warmup"""
     count_selection_steps: bool
@@ -55,6 +57,10 @@ class RunSettings(TypedDict, total=False):
     """a member whose episode has ended waits until all have ended"""
     replay_scope: Literal["shared", "member"]
     """one shared replay, or one per member"""
+    vary: dict[str, Any]
+    """settings that differ between members, such as gamma=0.98,0.99; may be repeated; one of..."""
+    vary_by: Literal["grid", "draw"]
+    """give members the points of the grid of --vary, or draw each value as often"""
     mean_actions: Literal["auto", "on", "off"]
     """also evaluate the mean action of all members and that of their EMA actors; auto: of..."""
     ema_tau: float
