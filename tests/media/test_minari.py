@@ -56,6 +56,17 @@ def test_data_set_loads_back_equal(
     assert returns == pytest.approx(evaluate(pendulum, episodes=3, seed=4).returns)
 
 
+@pytest.mark.parametrize("folder", ["", "data"])
+def test_a_folder_may_be_relative(
+    folder: str, pendulum: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(folder).mkdir(exist_ok=True)
+    export(pendulum, "minari", Path(folder) / "near-v0", episodes=1)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / folder))
+    assert minari.load_dataset("near-v0").total_steps == 30
+
+
 def _seed(data: Any, number: int) -> int:
     return next(iter(data.storage.get_episode_metadata([number])))["seed"]
 

@@ -42,7 +42,9 @@ def to_minari(
         buffers = [_episode(policy, world, number) for number in range(episodes)]
         returns = [float(np.sum(buffer["rewards"])) for buffer in buffers]
         kind = need("minari", "minari.data_collector", INSTALL).EpisodeBuffer
-        with setting("MINARI_DATASETS_PATH", str(path.parent)), warnings.catch_warnings():
+        # Minari joins a relative folder to itself.
+        root = str(path.parent.resolve())
+        with setting("MINARI_DATASETS_PATH", root), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of fields that may be left out
             minari.create_dataset_from_buffers(
                 path.name,
