@@ -41,6 +41,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "imagined": [{"budget": "45k"}],
     "precision": [{"budget": "100k"}, {"budget": "200k"}],
     "walkers": [{"budget": "30k"}],
+    "champions": [{"budget": "100k", "reference": "crossq-small"}],
 }
 
 
