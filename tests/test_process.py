@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pacesetter import process
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.process import (
@@ -48,6 +49,12 @@ def test_what_is_used_is_what_is_recorded(
     assert provenance()["threads"] == expected
     fix_threads()  # which XLA reads for itself
     assert os.environ["NPROC"] == str(expected)
+
+
+def test_a_system_that_tells_no_cores_has_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert process.cores() == list(range(os.cpu_count() or 1))
 
 
 def test_an_unset_number_is_one_thread_per_core(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -160,6 +160,36 @@ def test_a_folder_that_cannot_be_synced(
     assert (tmp_path / "file").read_bytes() == b"1"
 
 
+@pytest.mark.parametrize("answer", [None, errno.EOPNOTSUPP, errno.EINVAL])
+def test_space_is_reserved_where_the_system_cannot(
+    answer: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By zeros, as on macOS and some file systems; what is there stays."""
+
+    def refuse(*arguments: Any) -> None:
+        assert answer is not None
+        raise OSError(answer, os.strerror(answer))
+
+    if answer is None:
+        monkeypatch.delattr(os, "posix_fallocate")
+    else:
+        monkeypatch.setattr(os, "posix_fallocate", refuse)
+    (tmp_path / "file").write_bytes(b"rows")
+    with (tmp_path / "file").open("r+b") as file:
+        storage.reserve(file.fileno(), 3_000_001)
+    assert (tmp_path / "file").read_bytes() == b"rows" + bytes(2_999_997)
+    assert (tmp_path / "file").stat().st_blocks * 512 >= 3_000_001
+
+
+def test_a_full_disk_reserves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with (tmp_path / "file").open("w+b") as file, pytest.raises(OSError, match="No space"):
+        storage.reserve(file.fileno(), 100)
+
+
 def link_to_a_file(path: Path) -> None:
     other = path.with_name("other")
     other.write_bytes(b"another's")

@@ -132,7 +132,7 @@ class Config(NamedTuple):
 
 def presets() -> dict[str, Settings]:
     """The shipped presets by name."""
-    return tomllib.loads(Path(algorithms.__file__).with_name("presets.toml").read_text())
+    return tomllib.loads(Path(algorithms.__file__).with_name("presets.toml").read_text("utf-8"))
 
 
 def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:

@@ -33,8 +33,10 @@ class Interrupted(KeyboardInterrupt):
 
 
 def cores() -> list[int]:
-    """The cores that this process may use."""
-    return sorted(os.sched_getaffinity(0))
+    """The cores that this process may use; all of the machine where a system does not tell."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
 
 
 def threads() -> int:

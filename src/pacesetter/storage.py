@@ -25,6 +25,7 @@ TEMPORARY = ".pacesetter-tmp"
 NOT_REGULAR = "is not a regular file"
 # What opening answers for a link, a pipe that nobody reads, and a folder.
 _ODD = {errno.ELOOP, errno.EMLINK, errno.ENXIO, errno.EISDIR}
+_NO_RESERVE = {errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 _NO_LINKS = {errno.EPERM, errno.EACCES, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK}
 
 # What reading a damaged or hostile file may raise besides UsageError.
@@ -83,6 +84,23 @@ def regular(path: str | Path, flags: int) -> int:
         os.close(file)
         raise OSError(errno.EINVAL, NOT_REGULAR, str(path))
     return file
+
+
+def reserve(file: int, size: int) -> None:
+    """Make an open file `size` bytes long, with zeros and real blocks behind them.
+
+    Without blocks, a full disk would kill the process at a later write to a map of the file.
+    """
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(file, 0, size)
+            return
+        except OSError as error:
+            if error.errno not in _NO_RESERVE:
+                raise
+    zeros = bytes(2**20)
+    for start in range(os.fstat(file).st_size, size, len(zeros)):
+        os.pwrite(file, zeros[: size - start], start)
 
 
 def read_bytes(path: Path) -> bytes:

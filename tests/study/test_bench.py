@@ -431,6 +431,92 @@ def test_words_of_a_command_decide_nothing(jobs: list[Job]) -> None:
     assert work.failed == {str(jobs[0]): "exit 2: the robot is in use by me"}
 
 
+def test_a_run_in_use_by_nobody_is_not_tried_for_ever(jobs: list[Job]) -> None:
+    """Exit 75 counts while a process has the lock."""
+    work = run(jobs[:1], executor := Here(*[lambda words: Outcome(75, "in use")] * 9))
+    assert len(executor.calls) == 3
+    assert work.failed == {str(jobs[0]): "exit 75: in use"}
+
+
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "pipe": pipe,
+    "folder": folder,
+    "no JSON": lambda path: path.write_text("{"),
+    "no UTF-8": lambda path: path.write_bytes(b"\xff"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_run_spoils_no_other(
+    damage: str, jobs: list[Job], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is named at once and at the end; the others are made."""
+    stop_at(200)(jobs[0].words)
+    DAMAGES[damage](jobs[0].directory.config_file)
+    work = Bench(jobs)
+    assert [job for job in jobs if str(job) not in work.failed] == jobs[1:] == work.left
+    assert "config.json" in work.failed[str(jobs[0])]
+    assert sum("config.json" in line for line in work.news) == 1
+    for _ in work.run(executor := Here()):
+        pass
+    assert (executor.calls, work.finished) == (["train"], jobs[1:])
+    capsys.readouterr()
+    assert main(["bench", "suite.toml", "--print", "commands"]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert "config.json" in printed.err
+
+
+ODD_ROWS = (
+    "3",
+    "[]",
+    "{}",
+    '{"kind": "eval", "step": "x"}',
+    '{"kind": "eval", "step": 7, "mean": "x"}',
+)
+
+
+@pytest.mark.parametrize("row", ODD_ROWS)
+def test_an_odd_row_spoils_no_progress(
+    row: str, jobs: list[Job], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor the list of runs, whose other lines stay."""
+    stop_at(200)(jobs[0].words)
+    stop_at(200)(jobs[1].words)
+    with jobs[0].directory.metrics_file.open("a") as log:
+        log.write(f"{row}\n")
+    work = Bench(jobs)
+    with bench_progress.display(work) as show:
+        show(work)
+    capsys.readouterr()
+    assert main(["list", "runs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any(str(jobs[0].directory.path) in line for line in lines)
+    assert any(str(jobs[1].directory.path) in line and "stopped" in line for line in lines)
+    assert main(["show", str(jobs[0].directory.path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_failure_that_cannot_be_written_spoils_no_other(jobs: list[Job]) -> None:
+    (jobs[0].directory.path / "failure.log").mkdir(parents=True)
+    work = run(jobs, executor := Here(lambda words: Outcome(2, "the fault")))
+    assert executor.calls == ["train", "train"]
+    assert [*work.failed] == [str(jobs[0])]
+    assert any("cannot write" in line and "failure.log" in line for line in work.news)
+    assert work.finished == jobs[1:]
+
+
 def test_run_of_other_settings_is_refused(
     jobs: list[Job], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -198,14 +198,33 @@ def test_trial_of_a_living_worker_is_left_alone() -> None:
     mine, lock = claim(first)
     yours, other = claim(second)
     assert (mine.number, yours.number) == (0, 1)
-    lock.close()
+    lock.free()
     again, lock = claim(second)
     assert (again.number, again.params) == (0, mine.params)
     last, third = claim(first)
     assert last.number == 2
     assert first._claim() is None
-    for file in (lock, other, third):
-        file.close()
+    for held in (lock, other, third):
+        held.free()
+
+
+def test_what_a_killed_worker_left_stops_nobody(here: Path) -> None:
+    """A lock of Optuna's own that leads nowhere, and a line of the journal that has no end."""
+    tuning = study()
+    (here / "study.log.lock").symlink_to("nowhere")
+    with (here / "study.log").open("ab") as journal:
+        journal.write(b'{"op_code":4,"worker')
+    again = study()
+    assert len(again.study.get_trials()) == len(tuning.study.get_trials())
+    again.study.ask()
+    for each in (tuning, study()):
+        assert [trial.state.name for trial in each.study.get_trials()] == ["RUNNING"]
+
+
+def test_a_study_that_is_a_pipe_is_refused(here: Path) -> None:
+    os.mkfifo(here / "study.log")
+    with pytest.raises(UsageError, match=r"study.log is not a study: not a file"):
+        study()
 
 
 def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:

@@ -110,12 +110,15 @@ def _print(suite: Suite, jobs: list[suites.Job], form: str) -> int:
     from pacesetter.study.bench.executors import commands, slurm
     from pacesetter.study.bench.queue import Bench
 
-    left = Bench(jobs).left
+    work = Bench(jobs)
+    left = work.left
+    for name, why in work.failed.items():
+        print(f"pacesetter: {name}: {why}", file=sys.stderr)
     if left:
         print(slurm(suite.name, left) if form == "slurm" else "\n".join(commands(left)))
-    else:
+    elif not work.failed:
         print("pacesetter: every run has finished", file=sys.stderr)
-    return 0
+    return 1 if work.failed else 0
 
 
 def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:

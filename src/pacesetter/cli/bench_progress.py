@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pacesetter.cli.progress import Pace, bars
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.storage import regular
+from pacesetter.storage import FAULTS, regular
 from pacesetter.study.bench.queue import Bench
 from pacesetter.study.bench.suite import Job
 
@@ -120,10 +120,10 @@ def _last(directory: RunDirectory) -> tuple[int, str]:
     for line in reversed(lines):
         try:
             row: Row = json.loads(line)
-        except ValueError:  # its beginning is missing
-            break
-        step = step or row["step"]
-        if row["kind"] == "eval":
-            result = f"{row['mean']:.1f}"
+            step = step or int(row["step"])
+            if row["kind"] == "eval":
+                result = f"{row['mean']:.1f}"
+                break
+        except FAULTS:  # its beginning is missing, or it is no row of ours
             break
     return step, result

@@ -11,7 +11,7 @@ from pacesetter.cli.flags import parser
 from pacesetter.cli.show import evaluations, state
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import Row, find_all
-from pacesetter.storage import as_json
+from pacesetter.storage import FAULTS, as_json
 from pacesetter.text import printable
 
 WIDTH = 88  # columns of a paragraph
@@ -119,8 +119,10 @@ def runs(folder: str) -> list[Row]:
         row: Row = {"name": str(run.path)}
         try:
             means = [each["mean"] for each in evaluations(run)]
-            rows.append(row | state(run) | {"return": means[-1] if means else None})
-        except (UsageError, KeyError, TypeError) as error:
+            whole = row | state(run) | {"return": means[-1] if means else None}
+            _run_cells(whole)  # one odd value must not end the list
+            rows.append(whole)
+        except (UsageError, *FAULTS) as error:
             rows.append(row | {"state": f"damaged or foreign: {error}"})
     return rows
 

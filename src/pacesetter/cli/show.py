@@ -8,7 +8,7 @@ from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
 from pacesetter.settings.budget import budget, is_spent
-from pacesetter.storage import as_json
+from pacesetter.storage import FAULTS, as_json
 from pacesetter.text import printable
 
 SHOWN = 5  # evaluations, unless all are asked for
@@ -29,9 +29,10 @@ def show(words: list[str]) -> int:
     run = find(found.run, found.runs)
     try:
         told = tell(run)
-    except (KeyError, TypeError) as error:
+        text = as_json(told) if found.json else _text(told, None if found.all else SHOWN)
+    except FAULTS as error:
         raise UsageError(f"{run.path}: damaged or foreign: {error}") from None
-    print(as_json(told) if found.json else _text(told, None if found.all else SHOWN))
+    print(text)
     return 0
 
 

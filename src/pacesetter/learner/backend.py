@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from pacesetter.errors import UsageError
-from pacesetter.process import threads
+from pacesetter.process import cores, threads
 
 # JAX's own defaults, held fast: the numbers of a seed depend on them.
 NUMERICS: dict[str, Any] = {
@@ -34,8 +34,8 @@ def prepare(device: str) -> list[str]:
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ and "HOME" in os.environ:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         # XLA splits loops for the cores it compiles on, which JAX's own key for a program ignores.
-        cores = f"{threads()}-threads-{len(os.sched_getaffinity(0))}-cores"
-        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter" / cores))
+        place = f"{threads()}-threads-{len(cores())}-cores"
+        jax.config.update("jax_compilation_cache_dir", str(home / "pacesetter" / place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     _refuse_no_device()

@@ -9,6 +9,7 @@ from pacesetter.evaluation import Evaluation, evaluate
 from pacesetter.media.extras import need
 from pacesetter.policy import Policy, load
 from pacesetter.runs import RunDirectory
+from pacesetter.storage import present
 
 INSTALL = "pacesetter[hub]"
 FILE, CARD, VIDEO = "policy.safetensors", "README.md", "replay.mp4"  # the hub plays a replay.mp4
@@ -81,7 +82,7 @@ def _one_line(repo_id: str) -> Generator[None]:
 def _command(path: Path) -> str | None:
     """The command line of the run in whose folder the policy lies, if it lies in one."""
     run = RunDirectory(path.parent)
-    return run.record().get("command") if run.config_file.exists() else None
+    return run.record().get("command") if present(run.config_file) else None
 
 
 def card(

@@ -16,7 +16,7 @@ from pacesetter.errors import UsageError
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError
 from pacesetter.replay.sampler import Sampler
-from pacesetter.storage import digest, regular
+from pacesetter.storage import digest, regular, reserve
 from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together
@@ -177,8 +177,7 @@ def _map_file(path: Path, size: int) -> mmap.mmap:
         raise UsageError(f"{path}: cannot be opened: {error.strerror}") from None
     try:
         size = max(size, os.fstat(file).st_size)
-        # Without real blocks behind it, a full disk would kill the process at a later write.
-        os.posix_fallocate(file, 0, size)
+        reserve(file, size)
         return mmap.mmap(file, size)
     except (OSError, OverflowError) as error:
         raise UsageError(

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 from collections.abc import Iterable
+from contextlib import suppress
 from glob import escape, glob
 from pathlib import Path
 from typing import Any
@@ -28,15 +29,8 @@ from pacesetter.storage import (
 
 CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.
-FREE_PER_SEED = {
-    "seed",
-    "steps",
-    "time",
-    "replay_horizon",
-    "lr_horizon",
-    "checkpoint_every",
-    "device",
-}
+HORIZONS = {"replay_horizon", "lr_horizon"}
+FREE_PER_SEED = {"seed", "steps", "time", "checkpoint_every", "device"} | HORIZONS
 
 
 class RunDirectory:
@@ -156,11 +150,18 @@ class RunDirectory:
             for file in (*self.files, self.config_file, self._lock.path):
                 file.unlink(missing_ok=True)
         self.unlock()
-        for folder in self._made:
-            try:
+        with suppress(OSError):  # somebody else has put something there
+            for folder in self._made:
                 folder.rmdir()
-            except OSError:  # somebody else has put something there
-                break
+
+    def remove_checkpoint(self) -> None:
+        """Give back the disk that only `resume` needs."""
+        last = self.state_file.parent
+        for file in self.files:
+            if file.parent == last:
+                file.unlink()
+        with suppress(OSError):  # somebody else has put something there
+            last.rmdir()
 
     def _write_config(self, table: Row) -> None:
         write_atomically(self.config_file, (as_json(table, indent=1) + "\n").encode())

@@ -87,15 +87,20 @@ class Lock:
             )
 
 
-@contextmanager
-def alone(lock: Lock) -> Generator[None]:
-    """Wait for a lock and hold it in the block."""
+def wait_for(lock: Lock) -> None:
+    """Take a lock as soon as it is free."""
     while True:
         try:
             lock.take()
-            break
+            return
         except InUseError:
             time.sleep(WAIT)
+
+
+@contextmanager
+def alone(lock: Lock) -> Generator[None]:
+    """Wait for a lock and hold it in the block."""
+    wait_for(lock)
     try:
         yield
     finally:

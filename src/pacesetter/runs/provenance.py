@@ -38,5 +38,5 @@ def _commit() -> str | None:
     if not (checkout / ".git").exists() or not (git := shutil.which("git")):
         return None
     describe = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    found = subprocess.run(describe, cwd=checkout, capture_output=True, text=True, check=False)
-    return found.stdout.strip() or None
+    found = subprocess.run(describe, cwd=checkout, capture_output=True, check=False)
+    return found.stdout.decode(errors="replace").strip() or None

@@ -15,7 +15,7 @@ def read_file(path: Path, name: str | None = None) -> Settings:
     The latter is refused if `name` is neither its algorithm nor its name. Raises UsageError.
     """
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
         table: Any = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"config: cannot read {path}: {error}") from None

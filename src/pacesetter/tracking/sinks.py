@@ -186,7 +186,7 @@ def _last(steps: list[int]) -> int:
 @contextmanager
 def _silent() -> Generator[None]:
     """The standard output is for the command's answer."""
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere, redirect_stdout(nowhere):
         yield
 
 

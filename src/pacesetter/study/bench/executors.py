@@ -116,7 +116,10 @@ def _popen(words: list[str], output: Any, folder: str | None = None) -> subproce
 
 @contextmanager
 def _pinned(core: int) -> Generator[None]:
-    """Pin processes started in here to one core from their first instruction."""
+    """Pin processes started in here to one core from their first instruction, if it can be."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {core})
     try:

@@ -66,29 +66,41 @@ def is_finished(job: Job) -> bool:
 
 def words_of(job: Job) -> list[str]:
     """The command that continues a run: `resume` if its folder holds one, else `train`."""
-    if job.directory.config_file.exists():
+    if storage.present(job.directory.config_file):
         return [*job.directory.resume_words(job.config), *job.always, "-q"]
     return [*job.words, *job.always, "-q"]
+
+
+def damaged(jobs: list[Job]) -> dict[str, str]:
+    """Jobs whose folder holds a run that cannot be read, and why; UsageError for another run."""
+    found: dict[str, str] = {}
+    for job in jobs:
+        try:
+            other = job.directory.difference_from(job.config)
+        except UsageError as error:
+            found[str(job)] = str(error)
+            continue
+        if other:
+            raise UsageError(
+                f"run: {job.directory.path} exists with {other}; "
+                "give other --runs, or the entry another name"
+            )
+    return found
 
 
 class Bench:
     """All jobs and where they are; refuses a folder that holds another run."""
 
     def __init__(self, jobs: list[Job]) -> None:
-        for job in jobs:
-            if found := job.directory.difference_from(job.config):
-                raise UsageError(
-                    f"run: {job.directory.path} exists with {found}; "
-                    "give other --runs, or the entry another name"
-                )
         self.jobs = jobs
-        done = [is_finished(job) for job in jobs]
-        self.finished = [job for job, over in zip(jobs, done, strict=True) if over]
+        self.failed = damaged(jobs)
+        self.news = [f"{name}: failed for good, {why}" for name, why in self.failed.items()]
+        whole = [job for job in jobs if str(job) not in self.failed]
+        done = [is_finished(job) for job in whole]
+        self.finished = [job for job, over in zip(whole, done, strict=True) if over]
         self.before = len(self.finished)
-        self.failed: dict[str, str] = {}
         self.running: dict[int, tuple[Job, Any, list[str]]] = {}
-        self.news: list[str] = []
-        self._waiting = deque(job for job, over in zip(jobs, done, strict=True) if not over)
+        self._waiting = deque(job for job, over in zip(whole, done, strict=True) if not over)
         self._failures: Counter[str] = Counter()
         self._aside: set[str] = set()
         self._stopping = False
@@ -155,14 +167,15 @@ class Bench:
                 self._end(job, words, outcome, stopped)
 
     def _end(self, job: Job, words: list[str], outcome: Outcome, stopped: bool) -> None:
-        overtaken = words[0] == "train" and job.directory.config_file.exists()
+        overtaken = words[0] == "train" and storage.present(job.directory.config_file)
+        held = outcome.code == IN_USE and job.directory.in_use()
         if is_finished(job):
             self._finish(job)
         elif stopped:
             self.news.append(f"{job}: stopped")
         elif outcome.code in SAVED:
             self._waiting.append(job)
-        elif outcome.code == IN_USE or (outcome.code == BAD_INPUT and overtaken):
+        elif held or (outcome.code == BAD_INPUT and overtaken):
             self._set_aside(job)
         elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
             self._fail(job, words, outcome)
@@ -182,9 +195,12 @@ class Bench:
         self.news.append(f"{job}: finished")
 
     def _fail(self, job: Job, words: list[str], outcome: Outcome) -> None:
-        folder = job.directory.path
-        if folder.is_dir():
-            (folder / "failure.log").write_text(f"$ {shlex.join(words)}\n{outcome.output}")
+        file, text = job.directory.path / "failure.log", f"$ {shlex.join(words)}\n{outcome.output}"
+        try:
+            if file.parent.is_dir():
+                storage.write_atomically(file, text.encode(errors="backslashreplace"))
+        except OSError as error:  # no reason to give up the others
+            self.news.append(f"{job}: cannot write {file}: {error.strerror}")
         self.failed[str(job)] = _last_line(outcome)
         self.news.append(f"{job}: failed for good, {_last_line(outcome)}")
 

@@ -255,7 +255,7 @@ def _lines(path: Path) -> Iterator[tuple[str, Any, Path | None]]:
     if path.suffix != ".jsonl":
         raise UsageError(f"run: {path} is neither a run's folder nor a .jsonl file of results")
     try:
-        for number, line in enumerate(path.read_text().splitlines(), 1):
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
             yield f"{path}:{number}", json.loads(line), None
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{path}: damaged: {error}") from None

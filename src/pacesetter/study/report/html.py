@@ -80,8 +80,8 @@ def report(
         films=films,
         command=shlex.join(["pacesetter", *sys.argv[1:]]),
         own=", ".join(f"{name} {number}" for name, number in versions().items()),
-        style=Markup((HERE / "report.css").read_text()),
-        script=Markup((HERE / "report.js").read_text()),
+        style=Markup((HERE / "report.css").read_text("utf-8")),
+        script=Markup((HERE / "report.js").read_text("utf-8")),
     )
 
 

@@ -10,7 +10,7 @@ Source = dict[str, Any]
 
 @cache
 def _file() -> dict[str, Any]:
-    return tomllib.loads(Path(__file__).with_name("published.toml").read_text())
+    return tomllib.loads(Path(__file__).with_name("published.toml").read_text("utf-8"))
 
 
 def sources() -> list[Source]:

@@ -1,15 +1,12 @@
 """Files of a study: Optuna's journal, the ranges it searches, and locks that end with a process."""
 
-import fcntl
 import json
-from collections.abc import Generator
-from contextlib import contextmanager
-from io import TextIOWrapper
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.runs.lock import Lock, alone, wait_for
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import difference, fields_of
 from pacesetter.settings.values import Tune
@@ -18,6 +15,7 @@ from pacesetter.storage import FAULTS
 try:
     import optuna
     from optuna.storages.journal import JournalFileBackend, JournalStorage
+    from optuna.storages.journal._file import BaseJournalFileLock
 except ImportError:
     raise UsageError("tune: Optuna is not installed; pip install 'pacesetter[tune]'") from None
 
@@ -44,13 +42,15 @@ def distribution(range_: Tune) -> Any:
     return optuna.distributions.FloatDistribution(low, high, log)
 
 
-def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) -> optuna.Study:
+def open_study(
+    file: Path, lock: Lock, settings: Settings, searched: Ranges, patience: int
+) -> optuna.Study:
     """Open a study, or make one whose first trial has the default settings.
 
     A trial is pruned if it is below the median after `patience` reports. Raises UsageError if the
     file holds a study with other settings.
     """
-    study = _read(file, patience)
+    study = _read(file, lock, patience)
     about = settings | {f"range of {name}": mark for name, mark in searched.items()}
     new: Settings = json.loads(json.dumps(about))
     old = study.user_attrs.get("about")
@@ -64,12 +64,13 @@ def open_study(file: Path, settings: Settings, searched: Ranges, patience: int) 
     return study
 
 
-def _read(file: Path, patience: int) -> optuna.Study:
+def _read(file: Path, lock: Lock, patience: int) -> optuna.Study:
     """The study of a journal, all of which Optuna reads here and takes as it comes."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
+    _mend(file, lock)
     try:
         study = optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(file))),
+            storage=JournalStorage(JournalFileBackend(str(file), _JournalLock(lock))),
             study_name="pacesetter",
             direction="maximize",
             pruner=optuna.pruners.MedianPruner(n_warmup_steps=patience),
@@ -99,7 +100,9 @@ def _refuse_odd(study: optuna.Study) -> None:
 def refuse_foreign(file: Path) -> None:
     """Refuse a file that is not a journal, to which Optuna would write all the same."""
     try:
-        with file.open() as lines:
+        if file.exists() and not file.is_file():
+            raise ValueError("not a file")
+        with file.open(encoding="utf-8") as lines:
             line = lines.readline()
         if line and "op_code" not in json.loads(line):
             raise ValueError("not a journal of Optuna")
@@ -109,20 +112,32 @@ def refuse_foreign(file: Path) -> None:
         raise UsageError(f"study: {file} is not a study: {error}") from None
 
 
-def hold(path: Path) -> TextIOWrapper | None:
-    """A file locked until it is closed or the process ends; None if another has it."""
-    file = path.open("a")
+def hold(path: Path) -> Lock | None:
+    """A lock that is held now; None if another has it or may have it."""
+    lock = Lock(path)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.close()
+        lock.take()
+    except UsageError:
         return None
-    return file
+    return lock
 
 
-@contextmanager
-def alone(path: Path) -> Generator[None]:
-    """Let one process at a time into the block."""
-    with path.open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+class _JournalLock(BaseJournalFileLock):
+    """Optuna's own locks are files that outlive a killed process, and then nobody gets them."""
+
+    def __init__(self, lock: Lock) -> None:
+        self._lock = lock
+
+    def acquire(self) -> bool:
+        wait_for(self._lock)
+        return True
+
+    def release(self) -> None:
+        self._lock.free()
+
+
+def _mend(file: Path, lock: Lock) -> None:
+    """Cut off the line that a killed process has not finished; Optuna would stumble over it."""
+    with alone(lock), file.open("a+b") as journal:
+        journal.seek(0)
+        journal.truncate(journal.read().rfind(b"\n") + 1)

@@ -5,11 +5,9 @@ resumes its trial from the checkpoint, so no heartbeat is needed.
 """
 
 import json
-import shutil
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +18,11 @@ from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
+from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
-from pacesetter.storage import write_atomically
+from pacesetter.storage import present, write_atomically
 from pacesetter.study.bench.suite import TUNING_SEEDS
 from pacesetter.study.tune.journal import (
-    alone,
     distribution,
     hold,
     open_study,
@@ -55,7 +53,7 @@ class Tuning:
         self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
         self.runs = self.file.with_name(f"{self.file.name}.runs")
-        self._lock = self.runs / "lock"
+        self._lock, journal = Lock(self.runs / "lock"), Lock(self.runs / "journal.lock")
         self._trainer: Trainer | None = None
         self._stopping = False
         settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
@@ -64,7 +62,7 @@ class Tuning:
             self.runs.mkdir(parents=True, exist_ok=True)
             with alone(self._lock):
                 patience = run.steps // run.eval_every // 3
-                self.study = open_study(self.file, settings, self.ranges, patience)
+                self.study = open_study(self.file, journal, settings, self.ranges, patience)
         except OSError as error:
             raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
 
@@ -98,8 +96,10 @@ class Tuning:
         """Make trials until all have ended or other workers have them; `show` shows each one."""
         while not self._stopping and (claim := self._claim()):
             trial, lock = claim
-            with lock:
+            try:
                 self._try(trial, show)
+            finally:
+                lock.free()
             jax.clear_caches()  # each trial compiles programs of its own
 
     def summary(self) -> str:
@@ -112,7 +112,7 @@ class Tuning:
         best = self.study.best_trial
         return f"{text}; best {best.value:.1f} in trial {best.number}\nsettings: {self.best_file}"
 
-    def _claim(self) -> tuple[optuna.Trial, TextIOWrapper] | None:
+    def _claim(self) -> tuple[optuna.Trial, Lock] | None:
         """A trial that a dead worker left, or a new one, and its lock; None if there is none."""
         with alone(self._lock):
             for left in self.study.get_trials(deepcopy=False, states=(RUNNING,)):
@@ -143,7 +143,7 @@ class Tuning:
             return
         score = _score(trainer.directory.rows())
         self._tell(trial, PRUNED if pruned else COMPLETE, None if pruned else score, f"{score:.1f}")
-        shutil.rmtree(trainer.directory.state_file.parent)  # replays of all would fill the disk
+        trainer.directory.remove_checkpoint()  # replays of all would fill the disk
 
     def _train(self, trial: optuna.Trial, trainer: Trainer, sink: Sink) -> bool:
         """Whether it was pruned."""
@@ -167,7 +167,7 @@ class Tuning:
         given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
         config = resolve(self.algorithm, self.env, given)
         directory = RunDirectory.of(self.runs, config)
-        if not directory.config_file.exists():
+        if not present(directory.config_file):
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
             trainer = Trainer.resume(directory.path, allow=[self.algorithm, self.env])
