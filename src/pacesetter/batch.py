@@ -38,6 +38,7 @@ class Transition(NamedTuple):
     weight: Any = None  # importance weight, 1 if sampled uniformly
     starts: Any = None  # reset observations, for imagined episodes
     valid: Any = None  # number of valid rows of a padded replay
+    return_deviation: Any = None  # running standard deviation of discounted returns
 
 
 Batch = Transition  # many of them, as JAX arrays

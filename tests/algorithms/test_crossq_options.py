@@ -1,9 +1,11 @@
-"""CrossQ's options: no gradient through the next half of a batch, and weights of length 1."""
+"""CrossQ's options: no gradient through a batch's next half, weights of length 1, and bins."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numeric import KEY, close, member, random_batch, random_state, slopes, squashed
@@ -12,7 +14,8 @@ from short_runs import TINY, run_to_end
 from pacesetter.algorithms import crossq
 from pacesetter.batch import Spec
 from pacesetter.config import resolve
-from pacesetter.networks import batch_renorm
+from pacesetter.errors import UsageError
+from pacesetter.networks import batch_renorm, gaussian, mlp
 from pacesetter.training.trainer import Trainer
 
 SPEC = Spec(observation_size=3, action_size=2)
@@ -204,6 +207,80 @@ def test_presets() -> None:
     lean, kept = (resolve(n, "Walker2d-v5").hyper for n in ("crossq-lean", "crossq-wn"))
     assert (lean.critic_hidden, lean.weight_norm) == ((256, 256), False)
     assert (kept.critic_hidden, kept.weight_norm) == ((256, 256), True)
+    bins = [resolve(n, "Walker2d-v5").hyper.bins for n in ("crossq", "crossq-wn", "crossq-bins")]
+    assert bins == [0, 0, 51]
     assert not lean.next_batch_gradient
     assert not kept.next_batch_gradient
     assert kept.renorm_after > 10**8  # plain batch norm for as long as anyone trains
+
+
+# Bins.
+
+
+def test_critics_with_bins_learn_from_scaled_rewards(rng: np.random.Generator) -> None:
+    """Rewards over their returns' deviation: ten times both changes nothing, one alone does."""
+    algorithm = learner(bins=11)
+    state = algorithm.init(jax.random.key(0))
+    batch = batches(rng, updates=algorithm.updates_per_call)
+    found: list[Any] = []
+    for reward, deviation in ((1.0, 2.0), (10.0, 20.0), (10.0, 2.0)):
+        scaled = batch._replace(
+            reward=batch.reward * reward, return_deviation=jnp.float32(deviation)
+        )
+        after = algorithm.update(state, scaled, jax.random.key(1))
+        assert all(np.isfinite(loss) for loss in after.losses.values())
+        found.append(jax.tree.leaves(after.state.critic))
+    for one, same in zip(*found[:2], strict=True):
+        np.testing.assert_allclose(one, same, rtol=1e-3, atol=1e-5)
+    assert any(not np.allclose(a, b, atol=1e-4) for a, b in zip(found[0], found[2], strict=True))
+
+
+def test_loss_with_bins_is_that_of_the_head(rng: np.random.Generator) -> None:
+    """The first update's loss, told from the critics' own outputs in one pass: cross-entropy to
+    the target of the lowest critic, summed over critics; each critic has an output per bin.
+    """
+    algorithm = learner(bins=11)
+    state = algorithm.init(jax.random.key(0))
+    assert state.critic[-1]["kernel"].shape[-1] == 11
+    (batch,) = [jax.tree.map(lambda x: x[0], batches(rng))]
+    key = jax.random.key(2)
+    _, (loss, td_error) = algorithm.fit_critic(state, batch, key)
+    action, log_prob = gaussian.sample(batch_renorm.fold(state.actor), batch.next_observation, key)
+    rows = jnp.concatenate(
+        [
+            jnp.concatenate([batch.observation, batch.action], axis=-1),
+            jnp.concatenate([batch.next_observation, action], axis=-1),
+        ]
+    )
+    outputs, _ = mlp.each(partial(batch_renorm.train, warm=False), state.critic, rows)
+    now, later = jnp.split(outputs, 2, axis=1)
+    bonus = -jnp.exp(state.log_alpha) * log_prob
+    target = algorithm.head.target(later, batch.reward, batch.discount, bonus)
+    each, error = algorithm.head.loss(now, target)
+    np.testing.assert_allclose(loss, (batch.weight * each).mean(axis=1).sum(), rtol=1e-5)
+    np.testing.assert_allclose(td_error, error.max(axis=0), rtol=1e-4, atol=1e-6)
+
+
+def test_bins_in_a_run_are_off_unless_asked_for(runs: Path) -> None:
+    """The loop keeps the returns' deviation for such critics, and for no others."""
+    settings: dict[str, Any] = {**TINY, "steps": 300, "critic_hidden": (8,), "hidden": (8,)}
+    trainer = Trainer("crossq", "Pendulum-v1", runs=runs, bins=11, name="bins", **settings)
+    run_to_end(trainer)
+    assert trainer.loop.returns.sums[0] == 300
+    assert trainer.loop.returns.deviation > 1
+    plain = Trainer("crossq", "Pendulum-v1", runs=runs, **settings)
+    assert plain.loop.returns is None
+    assert "returns" not in plain.loop.parts()
+    plain.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "line"),
+    [
+        ({"bins": 1}, r"^bins: one bin cannot tell returns apart; 0, or at least 2, got 1$"),
+        ({"bins": 51, "replay": "lap"}, r"^bins: cannot be combined with --replay lap.*: 0, got"),
+    ],
+)
+def test_bins_that_cannot_be_are_refused(settings: dict[str, Any], line: str) -> None:
+    with pytest.raises(UsageError, match=line):
+        resolve("crossq", "Pendulum-v1", settings)

@@ -59,6 +59,13 @@ CASES = {
         "critic_hidden": (16, 16),
         "renorm_after": 100,
     },
+    "bins": {
+        "env": "Hopper-v5",
+        "algorithm": "multi-crossq",
+        "critic_hidden": (16, 16),
+        "bins": 11,
+        "members": 2,
+    },
     "sunrise": {"env": "Hopper-v5", "algorithm": "sunrise", "ensemble": 3},
     "one-of-sunrise": {  # its random learner of an episode, and blocks of updates
         "env": "Hopper-v5",
@@ -126,7 +133,7 @@ def test_killed_before_the_first_checkpoint(runs: Path) -> None:
 
 
 SLOW = ("normalized", "sac", "ou", "own-replays", "quantiles", "crossq")
-SLOW += ("sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
+SLOW += ("bins", "sunrise", "one-of-sunrise", "lap", "to-go", "assessed")
 SLOW += ("bf16", "steve", "steve-td3", "parameter", "trials", "episodes", "return", "async")
 
 

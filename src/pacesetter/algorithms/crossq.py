@@ -15,12 +15,12 @@ plain networks, into whose weights the running statistics are folded.
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from pydantic import Field
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms.contract import Array, Learner, Update, each_minibatch, last_minibatch
@@ -30,6 +30,16 @@ from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
 from pacesetter.settings.values import Count, Width
+
+
+def _check_bins(bins: int, info: ValidationInfo) -> int:
+    if bins == 1:
+        raise ValueError("one bin cannot tell returns apart; 0, or at least 2")
+    if bins and info.data.get("replay") == "lap":
+        raise ValueError(
+            "cannot be combined with --replay lap, as each sets the loss; allowed with it: 0"
+        )
+    return bins
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -64,9 +74,20 @@ class Hyper(OffPolicy):
     next_batch_gradient: bool = Field(
         True, description="gradient through (s', a') where they shape a batch's mean and variance"
     )
+    bins: Annotated[int, AfterValidator(_check_bins)] = Field(
+        0,
+        ge=0,
+        le=1_001,
+        description="bins of the return that each critic learns the shares of, usually 51, with "
+        "rewards over the running standard deviation of returns; 0 learns the mean",
+    )
     exploration: Exploration = Field(
         "policy", description="fixed: the stochastic policy explores by itself"
     )
+
+    @property
+    def scales_rewards(self) -> bool:
+        return self.bins > 0
 
 
 class State(NamedTuple):
@@ -96,6 +117,8 @@ class CrossQ(StochasticLearner):
     @cached_property
     def head(self) -> critic_heads.Head:
         """What the critics' outputs mean."""
+        if self.hyper.bins:
+            return critic_heads.categorical(self.hyper.bins)
         return critic_heads.choose(0, self.hyper.replay)
 
     def init(self, key: Array) -> State:
@@ -105,10 +128,12 @@ class CrossQ(StochasticLearner):
             batch_renorm.init(actor_key, observation, hyper.hidden, 2 * action)
         )
         new_critic = partial(
-            batch_renorm.init, inputs=observation + action, hidden=hyper.critic_hidden, outputs=1
+            batch_renorm.init, inputs=observation + action, hidden=hyper.critic_hidden
         )
         critic = self._unit_length(
-            jax.vmap(new_critic)(jax.random.split(critic_key, hyper.critics))
+            jax.vmap(partial(new_critic, outputs=self.head.outputs))(
+                jax.random.split(critic_key, hyper.critics)
+            )
         )
         log_alpha = jnp.log(jnp.asarray(hyper.initial_alpha, jnp.float32))
         return State(
@@ -122,6 +147,9 @@ class CrossQ(StochasticLearner):
         )
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
+        if self.hyper.scales_rewards:
+            scale = batch.return_deviation
+            batch = batch._replace(reward=batch.reward / scale, return_deviation=None)
         keys = jax.random.split(key, self.updates_per_call + 1)
         state, (critic_loss, td_error) = each_minibatch(self.fit_critic, state, batch, keys[:-1])
         state, losses = self.fit_actor(state, last_minibatch(batch), keys[-1])
@@ -138,7 +166,7 @@ class CrossQ(StochasticLearner):
     def values(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """Every critic's value (critics, B), by its running statistics."""
         folded = jax.vmap(batch_renorm.fold)(critic)
-        return mlp.each(mlp.outputs, folded, observation, action)[..., 0]
+        return self.head.value(mlp.each(mlp.outputs, folded, observation, action))
 
     # The pieces that `update` composes.
 
@@ -160,8 +188,9 @@ class CrossQ(StochasticLearner):
         def loss(critic: mlp.Network) -> tuple[Array, Any]:
             outputs, trained = mlp.each(forward, critic, *inputs)
             now, later = jnp.split(outputs, 2, axis=1)
-            next_q = self.head.min_q(later) - jnp.exp(state.log_alpha) * log_prob
-            target_q = jax.lax.stop_gradient(batch.reward + batch.discount * next_q)
+            bonus = -(jnp.exp(state.log_alpha) * log_prob)
+            target_q = self.head.target(later, batch.reward, batch.discount, bonus)
+            target_q = jax.lax.stop_gradient(target_q)
             losses, td_error = self.head.loss(now, target_q)
             return (batch.weight * losses).mean(axis=1).sum(), (td_error.max(axis=0), trained)
 

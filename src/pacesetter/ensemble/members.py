@@ -25,7 +25,7 @@ from pacesetter.envs import Environment
 from pacesetter.errors import blame
 from pacesetter.learner.compiled import of_transitions
 from pacesetter.learner.learners import Learners
-from pacesetter.learner.normalizer import Normalizer
+from pacesetter.learner.normalizer import Normalizer, ReturnScale
 from pacesetter.learner.schedule import factors
 from pacesetter.policy import Policy
 from pacesetter.replay.buffer import Replay, Sample, open_replays
@@ -54,6 +54,7 @@ class Members:
         ]
         self.queues = [NStepQueue(hyper.n_step) for _ in envs]
         self.replays: list[Replay] = []
+        self.returns = ReturnScale(hyper.gamma, len(envs)) if hyper.scales_rewards else None
         self.selector = Selector(config, self.budget, first.recipe)
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
         self.averages = Averages(run, self.learners, self.current_policy(0))
@@ -159,6 +160,8 @@ class Members:
         for complete in self.queues[i].push(transition):
             self.replay(k).add(complete, i)
         self.normalizer.add(transition.observation)
+        if self.returns:
+            self.returns.add(i, transition.reward, transition.last)
         member.steps += 1
         if progress.step > hyper.warmup or hyper.warmup_updates:
             member.updates_due += hyper.updates_per_step
@@ -205,12 +208,13 @@ class Members:
     def _update(self, members: list[int]) -> None:
         """One call of the update of each of these members, all at the same time."""
         statistics, samples = self.normalizer.statistics(), [self._sample(k) for k in members]
+        extra = {"return_deviation": self.returns.deviation} if self.returns else None
         inputs: list[Any] = []
         for k, sample in zip(members, samples, strict=True):
             member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
             made = member.update_calls * self.updates_per_call
             scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
-            inputs.append((member.update_calls, *data, None, scales))
+            inputs.append((member.update_calls, *data, extra, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):
             self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
@@ -268,6 +272,7 @@ class Members:
             "selector": self.selector,
             "kept": self.policy_checkpoints,
             "averages": self.averages,
+            **({"returns": self.returns} if self.returns else {}),
             **numbered("queue", self.queues),
             **numbered("replay", self.replays),
             **numbered("env", self.explorers),

@@ -55,3 +55,43 @@ class Normalizer:
     def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
         """The inverse of `arrays`."""
         self.sums, self._statistics = rebuild({"sums": self.sums}, arrays)["sums"], None
+
+
+class ReturnScale:
+    """Running standard deviation of discounted returns, by which a learner may divide rewards.
+
+    An env's return is that so far: its rewards, each discounted by its age; it begins anew with
+    each episode. All of them, of all envs and steps, are one sample (as in SimbaV2 and XQC).
+    """
+
+    def __init__(self, gamma: float, envs: int) -> None:
+        self.gamma = gamma
+        self.running: Reals = np.zeros(envs)
+        self.sums: Reals = np.zeros(3)  # count, mean, squared deviations
+
+    def add(self, env: int, reward: float, last: bool) -> None:
+        """Add a step of an env."""
+        self.running[env] = total = self.gamma * self.running[env] + reward
+        self.sums[0] += 1
+        change = total - self.sums[1]
+        self.sums[1] += change / self.sums[0]
+        self.sums[2] += change * (total - self.sums[1])
+        if last:
+            self.running[env] = 0.0
+
+    @property
+    def deviation(self) -> np.float32:
+        """It; 1 as long as all returns are equal."""
+        count, _, squares = self.sums
+        return np.float32(np.sqrt(squares / count)) if squares > 0 else np.float32(1)
+
+    def arrays(self) -> Arrays:
+        return {"running": self.running.copy(), "sums": self.sums.copy()}
+
+    def table(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, table: dict[str, Any], arrays: Arrays) -> None:
+        """The inverse of `arrays`."""
+        found = rebuild({"running": self.running, "sums": self.sums}, arrays)
+        self.running, self.sums = found["running"].copy(), found["sums"].copy()

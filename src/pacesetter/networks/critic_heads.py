@@ -12,6 +12,7 @@ import jax.numpy as jnp
 Array = jax.Array
 LAP_KINK = 1.0  # where LAP's loss turns from square to linear, and its smallest priority
 KAPPA = 1.0  # the same for quantiles
+BINS_LIMIT = 5.0  # the return of the last bin, in units of the returns' standard deviation
 
 
 def min_q(values: Any, axis: int = 0) -> Any:
@@ -38,8 +39,61 @@ class Head(NamedTuple):
         """
         if self.outputs == 1:
             return min_q(self.value(outputs))
+        return self.lowest(outputs).T
+
+    def lowest(self, outputs: Array) -> Array:
+        """Of N critics' outputs (N, B, M), those (B, M) of the critic with the lowest value."""
         lowest = self.value(outputs).argmin(axis=0)
-        return jnp.take_along_axis(outputs, lowest[None, :, None], axis=0)[0].T
+        return jnp.take_along_axis(outputs, lowest[None, :, None], axis=0)[0]
+
+    def target(self, outputs: Array, reward: Array, discount: Array, bonus: Array) -> Array:
+        """What `loss` moves towards: the reward plus the discounted lowest next value and bonus."""
+        return reward + discount * (self.min_q(outputs) + bonus)
+
+
+class Categorical(Head):
+    """Outputs are logits of M bins of the return, from -5 to 5 (Bellemare et al. 2017, C51).
+
+    A target is the lowest critic's distribution (B, M), its bins moved by reward, discount and
+    bonus, and shared out among the bins beside each; what lies beyond the last goes to the last.
+    Such critics need rewards whose discounted returns are of the size of 1.
+    """
+
+    def target(self, outputs: Array, reward: Array, discount: Array, bonus: Array) -> Array:
+        bins, shares = bins_of(self.outputs), jax.nn.softmax(self.lowest(outputs))
+        moved = reward[:, None] + discount[:, None] * (bins + bonus[:, None])
+        return project(shares, moved)
+
+
+def categorical(count: int) -> Head:
+    """The head with so many bins."""
+    return Categorical(count, _bins_mean, _bins_loss)
+
+
+def bins_of(count: int) -> Array:
+    """The returns (M,) that the bins stand for."""
+    return jnp.linspace(-BINS_LIMIT, BINS_LIMIT, count)
+
+
+def project(shares: Array, places: Array) -> Array:
+    """Shares (B, M) that lie at places (B, M), as shares of the bins: linear between two bins."""
+    count = shares.shape[-1]
+    width = 2 * BINS_LIMIT / (count - 1)
+    position = (jnp.clip(places, -BINS_LIMIT, BINS_LIMIT) + BINS_LIMIT) / width
+    near = jnp.clip(1 - jnp.abs(position[..., None] - jnp.arange(count)), 0, 1)  # (B, M, M)
+    return (shares[..., None] * near).sum(axis=-2)
+
+
+def _bins_mean(outputs: Array) -> Array:
+    """The distribution's mean as the value (...)."""
+    return (jax.nn.softmax(outputs) * bins_of(outputs.shape[-1])).sum(axis=-1)
+
+
+def _bins_loss(outputs: Array, target_q: Array) -> tuple[Array, Array]:
+    """Cross-entropy to the target's shares (B, M); its TD error is that of means."""
+    loss = -(target_q * jax.nn.log_softmax(outputs)).sum(axis=-1)
+    mean_of_target = (target_q * bins_of(target_q.shape[-1])).sum(axis=-1)
+    return loss, jnp.abs(mean_of_target - _bins_mean(outputs))
 
 
 def choose(quantiles: int, replay: str) -> Head:

@@ -154,6 +154,11 @@ class OffPolicy(Hyper):
     )
 
     @property
+    def scales_rewards(self) -> bool:
+        """Whether the learner divides rewards by the standard deviation of discounted returns."""
+        return False
+
+    @property
     def block(self) -> int:
         """Env steps of a member after which its due updates are made."""
         return self.update_every or 1
