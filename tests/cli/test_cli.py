@@ -367,6 +367,12 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--assess-after 100",
         {},
     ),
+    "multi-sac": (
+        "--steps 600 --hidden 8 --batch-size 8 --warmup 50 --num-envs 2 --lr-end 0.5 "
+        "--lr-horizon 900 --stop-at 1000000 --keep 2 --mean-actions on --ema-tau 0.1 "
+        "--snapshots 2 --no-renew-env --vary gamma=0.98,0.99 --vary-by draw",
+        {"vary": {"gamma": [0.98, 0.99]}},
+    ),
     "crossq": (
         "--steps 200 --hidden 8 --critic-hidden 8 6 --batch-size 8 --warmup 50 --critics 3 "
         "--policy-delay 2 --adam-momentum 0.9 --renorm-after 20 --alpha-learning-rate 1e-2 "
@@ -415,7 +421,8 @@ def test_every_flag_is_tried() -> None:
     """A new setting needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
     settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
-    assert settings - tried == {"algorithm", "env", "env_kwargs"}
+    own_tests = {"start_from"}  # needs a run that is there
+    assert settings - tried == {"algorithm", "env", "env_kwargs"} | own_tests
 
 
 # Those of learners with a state of their own kind are built beside the other tests of it.
