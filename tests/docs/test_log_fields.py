@@ -65,7 +65,7 @@ def test_page_tells_the_fields_that_runs_write(runs: Path) -> None:
     page, written = told(), {"eval": set[str](), "train": set[str](), "select": set[str]()}
     for algorithm in RUNS:
         for row in rows(runs, algorithm):
-            written[row["kind"]] |= row.keys() | row.get("mean_actions", {}).keys()
+            written[row["kind"]] |= row.keys()
     bins = {name for name in written["train"] if re.fullmatch(r"backup_weight_0\.\d", name)}
     written["train"] -= bins - {min(bins), max(bins)}
     for kind, names in written.items():
