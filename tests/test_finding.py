@@ -1,22 +1,23 @@
 """A run is found under every name that a person would type for it."""
 
-import json
+import re
 from pathlib import Path
 
 import pytest
+from compare import make_run
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find, find_group, find_matching
 
 
-def made(runs: Path, env: str, name: str, seed: int = 0) -> RunDirectory:
-    """A folder that says of which task it is."""
-    run = RunDirectory(runs / env.replace("/", "-").replace(":", "-") / name / str(seed))
-    run.path.mkdir(parents=True)
-    settings = {"algorithm": name, "env": env}
-    run.config_file.write_text(json.dumps({"schema": 1, "threads": 1, "settings": settings}))
-    return run
+def made(runs: Path, env: str, name: str) -> RunDirectory:
+    """A run that nobody trained, in the folder where `train` would put it."""
+    path = make_run(runs, env, name, budget=1_000, evaluations=1)
+    folder = runs / re.sub("[/:]", "-", env)
+    if folder != path.parents[1]:
+        path.parents[1].rename(folder)
+    return RunDirectory(folder / name / "0")
 
 
 NAMES = {
