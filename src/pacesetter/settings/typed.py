@@ -8,8 +8,8 @@ Name = Literal[
     "td3", "td7", "sac", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3", "ddpg", "trpo",
     "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-crossq", "multi-sunrise",
     "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg", "td3-paper",
-    "ddpg-original", "crossq-small", "crossq-lean", "crossq-wn", "td7-small", "sunrise-official",
-    "demo", "steve-paper", "me-trpo-paper"
+    "ddpg-original", "crossq-small", "crossq-lean", "crossq-bins", "crossq-wn", "td7-small",
+    "sunrise-official", "demo", "steve-paper", "me-trpo-paper"
 ]
 # fmt: on
 
@@ -169,6 +169,8 @@ class RunSettings(TypedDict, total=False):
     """keep the weights into every hidden unit at length 1"""
     next_batch_gradient: bool
     """gradient through (s', a') where they shape a batch's mean and variance"""
+    bins: int
+    """bins of the return that each critic learns the shares of, usually 51, with rewards..."""
     ensemble: int
     """learners in one state (N)"""
     mask_probability: float
