@@ -59,6 +59,9 @@ class Task:
         description="earlier run, or policy file, whose networks the members start with",
     )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
+    env_timeout: Duration | None = Field(
+        None, gt=0, description="longest time of a task's step or reset, such as 30s; default any"
+    )
     renew_env: bool | None = Field(
         None,
         description="make the task anew at each episode, so that none depends on those before it; "
@@ -94,7 +97,7 @@ class Config(NamedTuple):
         """How the run's task is made."""
         from pacesetter.envs import Recipe
 
-        return Recipe(self.run.env, self.run.env_kwargs)
+        return Recipe(self.run.env, self.run.env_kwargs, timeout=self.run.env_timeout)
 
     @property
     def steps_per_count(self) -> int:

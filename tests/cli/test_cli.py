@@ -340,7 +340,7 @@ def test_env_keyword_reaches_the_task(command: Command) -> None:
 # Runs that together use every flag, and the settings that differ from what is typed.
 SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": (
-        "--steps 0.3k --seed 3 --name all.of-it --time 10m --device cpu --checkpoint-every 1h "
+        "--steps 0.3k --seed 3 --name all.of-it --time 10m --env-timeout 1m --device cpu --checkpoint-every 1h "
         "--eval-every 150 --eval-episodes 2 --hidden 8 6 --batch-size 8 --replay-size 1k "
         "--warmup 50 --warmup-updates --updates-per-step 0.5 --update-at episode "
         "--actor-learning-rate 1e-3 "
@@ -348,7 +348,13 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--target-noise-clip 0.2 --exploration ou --exploration-noise 0.3 --critic-layer-norm "
         "--actor-layer-norm --gamma 0.9 --normalize-observation --quantiles 3 --replay uniform "
         "--precision bf16",
-        {"steps": 300, "time": 600, "checkpoint_every": 3600, "replay_size": 1000},
+        {
+            "steps": 300,
+            "time": 600,
+            "env_timeout": 60,
+            "checkpoint_every": 3600,
+            "replay_size": 1000,
+        },
     ),
     "multi-td3": (
         "--steps 400 --members 3 --rule top_half --select-on eval --select-every 130 "

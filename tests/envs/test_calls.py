@@ -4,7 +4,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -35,7 +37,7 @@ def raiser(error: BaseException) -> Callable[[], Any]:
 def test_whatever_it_raises_is_its_fault(function: Callable[[], Any], told: str) -> None:
     before = os._exit
     with stopping(lambda: None), pytest.raises(TaskError) as fault:
-        call("Robot-v0: step: failed", function)
+        call("Robot-v0: step: failed", None, function)
     assert str(fault.value) == f"Robot-v0: step: failed: {told}"
     assert os._exit is before
 
@@ -49,10 +51,10 @@ def test_a_signal_is_nobodys_fault(handler: Any, raised: type[BaseException]) ->
     before = signal.signal(signal.SIGINT, handler)
     try:
         with pytest.raises(raised):
-            call("step", lambda: signal.raise_signal(signal.SIGINT))
+            call("step", None, lambda: signal.raise_signal(signal.SIGINT))
         if handler is interrupt:  # and a task's own is still the task's
             with pytest.raises(TaskError):
-                call("step", raiser(KeyboardInterrupt()))
+                call("step", None, raiser(KeyboardInterrupt()))
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -66,10 +68,59 @@ def forks():
         os._exit(7)
     return os.waitstatus_to_exitcode(os.wait()[1])
 
-print(call("step", forks))
+print(call("step", None, forks))
 """
 
 
 def test_a_child_of_the_task_exits_as_it_likes() -> None:
     done = subprocess.run([sys.executable, "-c", FORKS], capture_output=True, text=True, timeout=60)
     assert (done.stdout, done.stderr) == ("7\n", "")
+
+
+# Limits of time.
+
+
+def stubborn() -> None:
+    """Hangs, and catches whatever it can."""
+    while True:
+        with suppress(Exception):
+            time.sleep(60)
+
+
+def test_a_call_that_hangs_is_woken() -> None:
+    before = time.monotonic()
+    with pytest.raises(TaskError) as fault:
+        call("Robot-v0: step: failed", 0.2, stubborn)
+    assert time.monotonic() - before < 2
+    assert str(fault.value) == (
+        "Robot-v0: step: failed: it has not returned after 0.2 s, the limit of --env-timeout"
+    )
+
+
+def test_a_call_within_its_time_is_left_alone() -> None:
+    """And nothing comes after it."""
+    assert call("step", 0.2, lambda: 7) == 7
+    time.sleep(0.3)
+
+
+HANGS_IN_C = """
+import ctypes
+from pacesetter.envs import limits
+from pacesetter.envs.calls import call
+
+limits.GRACE = 0.5
+mutex = (ctypes.c_char * 64)()
+library = ctypes.CDLL(None)
+library.pthread_mutex_lock(mutex)
+call("Robot-v0: step: failed", 0.2, library.pthread_mutex_lock, mutex)
+"""
+
+
+def test_a_call_that_hangs_in_c_ends_the_process() -> None:
+    words = [sys.executable, "-c", HANGS_IN_C]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
+        "pacesetter: stopped: Robot-v0: step: failed: "
+        "it has not returned after 0.2 s and cannot be woken\n"
+    )

@@ -262,6 +262,19 @@ def test_fault_of_env_stops_the_run(
     assert_same(whole, directory)
 
 
+def test_task_that_hangs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its step is named, and all before it is saved."""
+    words = ["train", "td3", "broken_envs:Hangs-v0", "--steps", "500", *FLAGS]
+    words += [f"--env.mark={tmp_path / 'mark'}", "--env-timeout", "1s", "--runs", str(tmp_path)]
+    assert main(words) == 1
+    error = capsys.readouterr().err
+    assert error == (
+        "pacesetter: stopped: member 0, step 148: broken_envs:Hangs-v0: step: failed: "
+        "it has not returned after 1 s, the limit of --env-timeout\n"
+    )
+    assert saved_step(only_run(tmp_path)) == 148
+
+
 def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:
     """The env of evaluations is number 2; the resumed run makes the evaluation again."""
     whole = run_to_end(late(tmp_path / "whole", eval_every=300, checkpoint_every=3600))

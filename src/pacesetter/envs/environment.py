@@ -122,7 +122,8 @@ class Environment:
         self._call("close", self.env.close)
 
     def _call(self, what: str, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
-        return call(f"{self.name}: {what}: failed", function, *given, **named)
+        limit = self.recipe.timeout
+        return call(f"{self.name}: {what}: failed", limit, function, *given, **named)
 
     def _broken(self, why: object) -> TaskError:
         return TaskError(f"{self.name}: {why}")

@@ -46,12 +46,14 @@ class Recipe:
     name: str
     kwargs: Settings = field(default_factory=dict)
     renew: bool = False  # make it anew at each episode
+    timeout: float | None = None  # seconds that a call into it may take
 
     def make(self) -> gymnasium.Env[Any, Any]:
         """A new env. Raises UsageError if the id or the task is wrong."""
         _refuse_unknown(self.name)
         try:
-            env = call(f"env: cannot make '{self.name}'", make_quietly, self.name, self.kwargs)
+            failed = f"env: cannot make '{self.name}'"
+            env = call(failed, self.timeout, make_quietly, self.name, self.kwargs)
         except TaskError as error:
             raise UsageError(str(error)) from None
         check_spaces(self.name, env)

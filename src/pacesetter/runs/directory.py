@@ -30,7 +30,7 @@ from pacesetter.storage import (
 CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.
 HORIZONS = {"replay_horizon", "lr_horizon"}
-FREE_PER_SEED = {"seed", "steps", "time", "checkpoint_every", "device"} | HORIZONS
+FREE_PER_SEED = {"seed", "steps", "time", "checkpoint_every", "device", "env_timeout"} | HORIZONS
 
 
 class RunDirectory:

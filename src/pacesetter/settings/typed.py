@@ -31,6 +31,8 @@ class RunSettings(TypedDict, total=False):
     """earlier run, or policy file, whose networks the members start with"""
     seed: int
     """seed of every random stream"""
+    env_timeout: float | str | None
+    """longest time of a task's step or reset, such as 30s; default any"""
     renew_env: bool | None
     """make the task anew at each episode, so that none depends on those before it; default..."""
     members: int

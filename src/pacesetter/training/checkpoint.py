@@ -24,7 +24,7 @@ from pacesetter.types import Arrays
 KIND = "checkpoint"
 SCHEMA = 4
 # What a run is given anew by flags of `resume`, or what changes no result of it.
-FREE_ON_RESUME = {"steps", "time", "stop_at", "name", "checkpoint_every", "device"}
+FREE_ON_RESUME = {"steps", "time", "stop_at", "name", "env_timeout", "checkpoint_every", "device"}
 LATER = ("averages",)  # parts that the first checkpoints of this schema have not
 
 
