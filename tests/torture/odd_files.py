@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import mutations
-from attempts import Tally, attempt, command, patched, trap
+from attempts import FINE, Tally, attempt, command, patched, trap
 from short_runs import TINY, run_to_end
 
 from pacesetter.errors import UsageError
@@ -173,7 +173,7 @@ def _made_study(folder: Path) -> bytes:
 
 
 def no_further(device: str) -> None:
-    raise UsageError("settings are fine; nothing is trained here")
+    raise UsageError(FINE)
 
 
 def run(folder: Path, kinds: Iterable[str], each: int, seed: int = 0) -> Tally:
