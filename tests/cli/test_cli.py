@@ -340,7 +340,8 @@ def test_env_keyword_reaches_the_task(command: Command) -> None:
 # Runs that together use every flag, and the settings that differ from what is typed.
 SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "td3": (
-        "--steps 0.3k --seed 3 --name all.of-it --time 10m --env-timeout 1m --device cpu --checkpoint-every 1h "
+        "--steps 0.3k --seed 3 --name all.of-it --time 10m --env-timeout 1m --device cpu "
+        "--checkpoint-every 1h "
         "--eval-every 150 --eval-episodes 2 --hidden 8 6 --batch-size 8 --replay-size 1k "
         "--warmup 50 --warmup-updates --updates-per-step 0.5 --update-at episode "
         "--actor-learning-rate 1e-3 "
