@@ -1,6 +1,7 @@
 """The settings of a run: merged from defaults, presets, files and flags, and checked once."""
 
 import json
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -62,6 +63,9 @@ class Task:
     env_timeout: Duration | None = Field(
         None, gt=0, description="longest time of a task's step or reset, such as 30s; default any"
     )
+    wrap: tuple[str, ...] = Field(
+        (), description="wrappers around the task, module:Class, the innermost first; repeatable"
+    )
     renew_env: bool | None = Field(
         None,
         description="make the task anew at each episode, so that none depends on those before it; "
@@ -97,7 +101,8 @@ class Config(NamedTuple):
         """How the run's task is made."""
         from pacesetter.envs import Recipe
 
-        return Recipe(self.run.env, self.run.env_kwargs, timeout=self.run.env_timeout)
+        run = self.run
+        return Recipe(run.env, run.env_kwargs, run.wrap, timeout=run.env_timeout)
 
     @property
     def steps_per_count(self) -> int:
@@ -160,7 +165,11 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
 
 
 def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
-    """Merge defaults, presets and the given layers, of which later ones win; check them once."""
+    """Merge defaults, presets and the given layers, of which later ones win; check them once.
+
+    An id without a version is of Gymnasium's newest.
+    """
+    env = _full_id(env)
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper
     merged: Settings = {"name": name.replace(":", "-")}
@@ -187,6 +196,14 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
         if run.steps < rollout:
             raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")
     return Config(run, hyper)
+
+
+def _full_id(env: str) -> str:
+    if ":" in env or re.search(r"-v\d+$", env):
+        return env
+    from pacesetter.envs.ids import full_id
+
+    return full_id(env)
 
 
 def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:

@@ -1,7 +1,7 @@
 """Seeded rollouts of any policy, on envs and start states that training never sees."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import inf
 from typing import Any
 
@@ -63,7 +63,7 @@ def rollouts(
 
 def evaluate(
     policy: Policy | None,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     episodes: int = 10,
     seed: int = 0,
     *,
@@ -73,8 +73,8 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on fresh episodes; without one, or if asked to, uniformly random actions.
 
-    The env defaults to the policy's own; `noise` is the standard deviation of Gaussian noise on
-    actions in [-1, 1]. Raises UsageError.
+    The env defaults to the policy's own; a `Recipe` gives one with wrappers. `noise` is the
+    standard deviation of Gaussian noise on actions in [-1, 1]. Raises UsageError.
     """
     if episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
@@ -92,28 +92,35 @@ def evaluate(
 
 def enter(
     policy: Policy | None,
-    env: str | None,
+    env: str | Recipe | None,
     seed: int,
     env_kwargs: dict[str, Any] | None = None,
     **extra: Any,
 ) -> Environment:
     """Make the given task or the policy's own and check that they fit; `extra` are its keywords."""
     about = policy.about if policy else {}
+    recipe = env if isinstance(env, Recipe) else _recipe(about, env, env_kwargs)
+    recipe = replace(recipe, kwargs=recipe.kwargs | extra)
+    world = Environment(recipe, seed, Stream.REPORT)
+    world.check()
+    if policy is not None:
+        _refuse_unfit(policy, world)
+    return world
+
+
+def _recipe(about: dict[str, Any], env: str | None, env_kwargs: dict[str, Any] | None) -> Recipe:
+    """The task by its id, with what the policy's file says of it if it is the policy's own."""
     name = env or about.get("env")
     if name is not None and not isinstance(name, str):
         raise UsageError(f"env: must be an id such as HalfCheetah-v5, got a {type(name).__name__}")
     if name is None:
         raise UsageError("env: the policy names no env; give one with --env")
     require("env", name, [env])
-    own = env_kwargs
-    if own is None:
-        own = about.get("env_kwargs", {}) if name == about.get("env") else {}
-    renew = bool(about.get("renew_env")) and name == about.get("env")
-    world = Environment(Recipe(name, own | extra, renew), seed, Stream.REPORT)
-    world.check()
-    if policy is not None:
-        _refuse_unfit(policy, world)
-    return world
+    own = about if name == about.get("env") else {}
+    for wrapper in own.get("wrap", ()):
+        require("wrap", wrapper)
+    kwargs = own.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
+    return Recipe(name, kwargs, tuple(own.get("wrap", ())), bool(own.get("renew_env")))
 
 
 def _refuse_unfit(policy: Policy, world: Environment) -> None:

@@ -151,6 +151,7 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     if not isinstance(about, dict):
         raise ValueError("about must be a table")
     kinds = {"env": str, "algorithm": str, "name": str, "env_kwargs": dict, "step": int}
+    kinds |= {"wrap": list}
     for name, kind in kinds.items():
         if not isinstance(about.get(name, kind()), kind):
             raise ValueError(f"{name} must be a {kind.__name__}")

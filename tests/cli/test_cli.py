@@ -145,7 +145,7 @@ def test_help_of_train_has_every_setting(command: Command) -> None:
     """With the range of each that has one."""
     text = re.sub(r"\s+", " ", command("train", "ddpg", "Ant-v5", "--help"))
     names = [field.name for kind in (Run, ddpg.Hyper) for field in fields(kind)]
-    hidden = {"algorithm", "env", "env_kwargs"}
+    hidden = {"algorithm", "env", "env_kwargs", "wrap"}
     assert [n for n in names if f"--{n.replace('_', '-')}" not in text and n not in hidden] == []
     assert "at least 0; at most 1; default 0.99" in text
     assert "full, weights or actor; default full" in text
@@ -348,7 +348,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
         "--critic-learning-rate 2e-3 --tau 0.01 --critics 3 --policy-delay 3 --target-noise 0.1 "
         "--target-noise-clip 0.2 --exploration ou --exploration-noise 0.3 --critic-layer-norm "
         "--actor-layer-norm --gamma 0.9 --normalize-observation --quantiles 3 --replay uniform "
-        "--precision bf16",
+        "--precision bf16 --no-renew-env",
         {
             "steps": 300,
             "time": 600,

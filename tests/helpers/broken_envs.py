@@ -117,10 +117,6 @@ class RaisesWhenMade(Probe):
         raise OSError("no licence file\nsee the manual")
 
 
-class DictObservation(Probe):
-    observation_space = Dict({"a": Box(-1, 1, (3,))})
-
-
 class DiscreteAction(Probe):
     action_space = Discrete(4)
 

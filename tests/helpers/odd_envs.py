@@ -5,8 +5,10 @@ They are named `odd_envs:NAME-v0`. What can be cast is cast; the rest is refused
 
 from typing import Any, NoReturn
 
+import gymnasium
 import numpy as np
 from broken_envs import Probe, Reward, register
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 
 class Mute(Exception):  # noqa: N818
@@ -132,6 +134,90 @@ class Fails(Probe):
         if self.count > 30:
             raise RuntimeError("the motor is on fire")
         return super().step(action)
+
+
+class Goal(Probe):
+    """Observes a Dict, as robots with goals do."""
+
+    observation_space = Dict(place=Box(-9, 9, (2,), np.float32), clock=Box(-1, 1, (1,), np.float32))
+
+    def see(self) -> dict[str, Any]:
+        return {"place": self.point[:2].copy(), "clock": self.point[2:].copy()}
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        return self.see(), {}
+
+    def step(self, action: Any) -> Any:
+        _, *rest = super().step(action)
+        return self.see(), *rest
+
+
+class Pair(Goal):
+    observation_space = Tuple([Box(-9, 9, (2,), np.float32), Discrete(3)])
+
+    def see(self) -> Any:
+        return self.point[:2].copy(), 1
+
+
+class LateDict(Goal):
+    """Leaves a part of its observation out."""
+
+    observation_space = Dict({"speed": Box(-9, 9, (2,)), "place": Box(-9, 9, (2,))})
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        return {"speed": np.zeros(2, np.float32), "place": np.zeros(2, np.float32)}, {}
+
+
+class DiscreteObservation(Probe):
+    observation_space = Discrete(3)
+
+
+class Image(Probe):
+    observation_space = Box(0, 255, (8, 8, 3), np.uint8)
+
+
+class DictOfImage(Probe):
+    observation_space = Dict({"a": Tuple([Box(0, 255, (8, 8, 3), np.uint8)])})
+
+
+class MuteSpace(Probe):
+    @property
+    def observation_space(self) -> Any:
+        raise Mute
+
+
+def _with_bounds(space: Box, low: Any) -> Box:
+    space.low = low
+    return space
+
+
+class WordBounds(Probe):
+    observation_space = _with_bounds(Box(-9, 9, (3,), np.float32), np.array(["a", "b", "c"]))
+
+
+class NoBounds(Probe):
+    action_space = _with_bounds(Box(-1, 1, (2,), np.float32), None)
+
+
+class NarrowBounds(Probe):
+    action_space = Box(np.array([-1, 0.1]), np.array([1, 0.1]), dtype=np.float64)
+
+
+class Doubled(gymnasium.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> Any:
+        return 2 * reward
+
+
+class Raised(gymnasium.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> Any:
+        return reward + 1
+
+
+class MuteWrapper(gymnasium.Wrapper[Any, Any, Any, Any]):
+    def __init__(self, env: Any) -> None:
+        raise Mute
 
 
 register(__name__)

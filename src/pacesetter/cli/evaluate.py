@@ -15,11 +15,12 @@ def evaluate(words: list[str]) -> int:
     """Score a policy on fresh episodes."""
     from pacesetter import evaluation
 
-    given, (policy, path, env, env_kwargs) = parse(_parser(), words)
-    task = env or policy.about.get("env")
-    how: dict[str, Any] = {"noise": given.noise, "env_kwargs": env_kwargs, "random": given.random}
+    given, found = parse(_parser(), words)
+    policy, path, env_kwargs = found.policy, found.file, found.env_kwargs
+    task = found.env or policy.about.get("env")
+    how: dict[str, Any] = {"noise": given.noise, "random": given.random, **found.task}
     with aside():
-        result = evaluation.evaluate(policy, env, given.episodes, given.seed, **how)
+        result = evaluation.evaluate(policy, episodes=given.episodes, seed=given.seed, **how)
     if given.json:
         about = {"env": task, "env_kwargs": env_kwargs, "seed": given.seed, "noise": given.noise}
         source = None if given.random else str(path)

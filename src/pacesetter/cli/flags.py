@@ -1,8 +1,11 @@
 """Command-line flags read off the settings classes: names, help, ranges and defaults."""
 
 import argparse
+import json
+import sys
 import tomllib
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any, ClassVar, Literal, NoReturn, get_args, get_origin
 
 from pacesetter import consent
@@ -45,6 +48,8 @@ class Parser(argparse.ArgumentParser):
                 raise unknown("flag", flag, self._option_string_actions, f"{self.prog} --help")
         if rest:
             raise UsageError(f"argument: '{rest[0]}' is one too many; see `{self.prog} --help`")
+        names = (getattr(found, each, None) or () for each in ("allow", "env", "envs", "wrap"))
+        look_here(*(name for each in names for name in ([each] if isinstance(each, str) else each)))
         return found
 
     def knows(self, flag: str) -> bool:
@@ -84,10 +89,17 @@ def parser(prog: str, description: str) -> Parser:
     return Parser(prog=f"pacesetter {prog}", description=description, allow_abbrev=False)
 
 
+def look_here(*names: str | None) -> None:
+    """Find modules that the command line names in the current folder too, after all others."""
+    if any(":" in name for name in names if name) and (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+
+
 def algorithm_and_env(command: Parser, words: list[str]) -> tuple[str, str, list[str]]:
     """The first two words of `train` and `tune`, and the rest; without them, help or a refusal."""
     given = [word for word in words[:2] if not word.startswith("-")]
     if len(given) == 2:
+        look_here(*given)
         return given[0], given[1], words[2:]
     command.add_argument("ALGO", help="algorithm or preset; see `pacesetter list algorithms`")
     command.add_argument("ENV", help="Gymnasium id such as HalfCheetah-v5, or module:Id-v0")
@@ -120,6 +132,8 @@ def add_settings(
         options["help"] = argparse.SUPPRESS if name in hidden else _help(name, info, defaults)
         if info.annotation in (bool, bool | None):
             options["action"] = argparse.BooleanOptionalAction
+        elif info.annotation == tuple[str, ...]:
+            options |= {"action": "extend", "nargs": "+", "metavar": "MODULE:CLASS"}
         elif get_origin(info.annotation) is tuple:
             options |= {"nargs": "+", "metavar": "N"}
         elif get_origin(info.annotation) is dict:
@@ -160,9 +174,17 @@ def _value(text: str) -> Any:
         return {"true": True, "false": False, "none": None}[text.lower()]
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return _json(text)
+    return value if isinstance(value, (int, float, str, list, dict)) else text
+
+
+def _json(text: str) -> Any:
+    """A table as JSON writes it, or else the text."""
+    try:
+        return json.loads(text) if text.startswith(("{", "[")) else text
+    except (ValueError, RecursionError):
         return text
-    return value if isinstance(value, (int, float, str, list)) else text
 
 
 def _allowed(info: Any) -> list[str]:

@@ -109,7 +109,7 @@ LISTS: dict[str, Callable[[], list[Row]]] = {
     "suites": suites,
     "champions": champions,
 }
-HINTS = {"envs": "any other Gymnasium id with Box observations and actions, or module:Id-v0"}
+HINTS = {"envs": "any other Gymnasium id with observations and actions of numbers, or module:Id-v0"}
 
 
 def runs(folder: str) -> list[Row]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pacesetter.cli.flags import Parser, split_env_kwargs
+from pacesetter.consent import require
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import Settings
 from pacesetter.storage import NOT_REGULAR, is_regular, present
@@ -24,17 +25,29 @@ class Found(NamedTuple):
     file: Path
     env: str | None
     env_kwargs: Settings
+    wrap: tuple[str, ...] | None  # None where there are none
 
     @property
     def task(self) -> dict[str, Any]:
         """As the functions of `media` take it."""
-        return {"env": self.env, "env_kwargs": self.env_kwargs}
+        if self.wrap is None:
+            return {"env": self.env, "env_kwargs": self.env_kwargs}
+        from pacesetter.envs import Recipe
+
+        about = self.policy.about
+        name = self.env or about["env"]
+        renew = bool(about.get("renew_env")) and name == about.get("env")
+        return {"env": Recipe(name, self.env_kwargs, self.wrap, renew)}
 
 
 def add_run(command: Parser) -> None:
     """RUN, and the flags of the task that its policy plays."""
     command.add_argument("run", metavar="RUN|FILE", help=RUN)
     command.add_argument("--env", metavar="ID", help="task to play (default the policy's own)")
+    wrap = "wrappers around it, the innermost first (default the policy's own); may be repeated"
+    command.add_argument(
+        "--wrap", action="extend", nargs="+", default=[], metavar="MODULE:CLASS", help=wrap
+    )
     command.add_env_keywords()
     command.add_allow()
     command.add_runs()
@@ -60,7 +73,21 @@ def parse(command: Parser, words: list[str]) -> tuple[Namespace, Found]:
     env = given.env or (own if own in given.allow else None)
     if (env or own) == own:
         env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
-    return given, Found(policy, file, env, env_kwargs)
+    return given, Found(policy, file, env, env_kwargs, _wrap(policy.about, env, given))
+
+
+def _wrap(about: dict[str, Any], env: str | None, given: Namespace) -> tuple[str, ...] | None:
+    """The wrappers that the command line gives, or those of the policy's own task if it allows."""
+    name = env or about.get("env")
+    own = about.get("wrap", []) if name == about.get("env") else []
+    if not given.wrap and not own:
+        return None
+    if not isinstance(name, str):
+        raise UsageError("env: the policy names no env; give one with --env")
+    require("env", name, [env])
+    for wrapper in [] if given.wrap else own:
+        require("wrap", str(wrapper), given.allow)
+    return tuple(given.wrap or own)
 
 
 def policy_file(run: str, runs: str) -> Path:

@@ -146,6 +146,6 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     called = name_of(trainer.directory.path)
     print(f"policy: {trainer.directory.policy_file}")
     print(f"run: {called}, a name for show, eval, record, resume and compare")
-    film = ["record", called, "-o", "walk.mp4", *consent.words(run.env)]
+    film = ["record", called, "-o", "walk.mp4", *consent.words(run.env, *run.wrap)]
     print(f"watch it: `pacesetter {shlex.join(film)}`")
     return 0

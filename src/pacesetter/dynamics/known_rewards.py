@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from pacesetter.algorithms.contract import Array
 from pacesetter.dynamics.model import Known
-from pacesetter.errors import UsageError, unknown
+from pacesetter.errors import UsageError
 
 See = Callable[[Array], Array]  # a number (...) that an observation (..., O) shows
 HARMLESS = {"max_episode_steps", "render_mode", "width", "height", "camera_id", "camera_name"}
@@ -46,7 +46,10 @@ class Task(NamedTuple):
 def of(env: str, env_kwargs: dict[str, Any] | None = None) -> Known:
     """Known functions of a task by its Gymnasium id; refuses unknown ids and changed tasks."""
     if env not in TASKS:
-        raise unknown("env with known reward", env, TASKS)
+        raise UsageError(
+            f"known: the reward of {env} is not known, only that of {', '.join(TASKS)}; give "
+            "--no-known, and it is learned too"
+        )
     if changed := set(env_kwargs or {}) - HARMLESS:
         raise UsageError(
             f"env_kwargs: {min(changed)} may change the reward, which is known of {env} as it is; "

@@ -4,7 +4,8 @@ import gymnasium
 
 from pacesetter.envs.border import Step
 from pacesetter.envs.environment import Environment, Snapshot
-from pacesetter.envs.tasks import Recipe, known
+from pacesetter.envs.ids import known
+from pacesetter.envs.tasks import Recipe
 
 __all__ = ["Environment", "Recipe", "Snapshot", "Step", "known"]
 

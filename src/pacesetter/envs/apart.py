@@ -61,7 +61,7 @@ def choose(recipe: Recipe, renew: bool | None) -> Apart:
     """As is wished, or by a test, which makes the task some times more."""
     if renew is not None:
         return Apart.BY_RENEWAL if renew else Apart.UNTESTED
-    if _resets_wholly(recipe.name):
+    if _resets_wholly(recipe.name) and not recipe.wrap:
         return Apart.BY_RESET
     aged = Environment(recipe, 0, Stream.REPORT)
     for number in range(BEFORE):

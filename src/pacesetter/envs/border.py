@@ -37,8 +37,11 @@ def step(given: Any, shape: Shape) -> Step:
     seen, paid, terminated, truncated, info = given
     if not isinstance(info, (dict, Mapping)):
         raise ValueError(f"info: must be a dict, got {show(info)}; {{}} will do")
-    flags = flag("terminated", terminated), flag("truncated", truncated)
-    return Step(observation(seen, shape), reward(paid), *flags, info)
+    if type(terminated) is not bool:
+        terminated = flag("terminated", terminated)
+    if type(truncated) is not bool:
+        truncated = flag("truncated", truncated)
+    return Step(observation(seen, shape), reward(paid), terminated, truncated, info)
 
 
 def observation(given: Any, shape: Shape) -> Floats:
@@ -48,7 +51,7 @@ def observation(given: Any, shape: Shape) -> Floats:
         if raw.dtype.kind not in "bfiuO":
             raise TypeError
         inside = np.abs(raw) <= LARGEST
-        finite = inside.all()
+        finite = np.logical_and.reduce(inside, axis=None)  # `all` without a call of Python
         flat = np.array(raw if finite else 0, np.float32).ravel()
     except Exception:
         raise ValueError(f"observation: must be numbers, got {show(given)}") from None

@@ -10,6 +10,7 @@ from pacesetter.envs.border import Step
 from pacesetter.envs.calls import call
 from pacesetter.envs.spaces import action_bounds
 from pacesetter.envs.tasks import Recipe
+from pacesetter.envs.wrappers import notes_on_wrappers
 from pacesetter.errors import TaskError, UsageError
 from pacesetter.policy import to_env
 from pacesetter.seeding import Stream, episode_seed
@@ -94,7 +95,8 @@ class Environment:
         space = self.env.observation_space
         try:
             self.reset(0)
-            notes = [*border.notes_on_observation(self.given, space)]
+            notes = [*notes_on_wrappers(self.env)]
+            notes += border.notes_on_observation(self.given, space)
             self.step(np.zeros(self.action_size, np.float32))
         except TaskError as error:
             raise UsageError(f"env: {error}") from None

@@ -4,32 +4,70 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Tuple
 
-from pacesetter.errors import UsageError
+from pacesetter.envs.calls import call
+from pacesetter.errors import TaskError, UsageError, show
 from pacesetter.types import Floats
+
+WRAP = "--wrap module:Class"
+WAYS_OUT = {
+    "observation": f"give a wrapper that makes a Box of it, such as {WRAP}",
+    "action": f"train on continuous actions, or give a wrapper that takes them, such as {WRAP}",
+}
+
+
+def space_of(name: str, env: gymnasium.Env[Any, Any], what: str) -> Any:
+    """The observation or the action space of an env; None if it has none."""
+    try:
+        return call(f"env: {name}: {what} space: failed", None, getattr, env, f"{what}_space", None)
+    except TaskError as error:
+        raise UsageError(str(error)) from None
+
+
+def refuse_images(name: str, space: Any) -> None:
+    """Refuse pictures, also inside a Dict or a Tuple: layers of plain units do not see."""
+    inside: Any = space.spaces if isinstance(space, (Dict, Tuple)) else ()
+    for part in inside.values() if isinstance(inside, dict) else inside:
+        refuse_images(name, part)
+    if isinstance(space, Box) and space.dtype == np.uint8 and len(space.shape) >= 3:
+        size = "x".join(map(str, space.shape))
+        raise UsageError(
+            f"env: {name}: observation space: is an image of {size} bytes, and no algorithm here "
+            f"has layers that see; train on numbers, or {WAYS_OUT['observation']}"
+        )
 
 
 def check_spaces(name: str, env: gymnasium.Env[Any, Any]) -> None:
     """Refuse spaces that are no boxes of numbers, or actions without finite bounds."""
     for what in ("observation", "action"):
-        _check_space(f"env: {name}: {what} space", getattr(env, f"{what}_space", None))
+        _check_space(name, what, space_of(name, env, what))
+    refuse_images(name, env.observation_space)
+    where, space = f"env: {name}: action space", show(env.action_space)
     if not np.issubdtype(env.action_space.dtype, np.floating):
         raise UsageError(
-            f"env: {name}: action space: must be of float32 or float64, got {env.action_space}"
+            f"{where}: must be of float32 or float64, got {space}; {WAYS_OUT['action']}"
         )
-    if not np.isfinite(np.concatenate(action_bounds(env))).all():
+    low, high = action_bounds(env)
+    if not np.isfinite(np.concatenate([low, high])).all():
         raise UsageError(
-            f"env: {name}: action space: its bounds must be finite, got {env.action_space}"
+            f"{where}: its bounds must be finite, got {space}; give some with a wrapper ({WRAP})"
         )
+    if not (low <= high).all():
+        n = int(np.flatnonzero(low > high)[0])
+        raise UsageError(f"{where}: number {n} has no float32 number between its bounds")
 
 
-def _check_space(what: str, space: Any) -> None:
+def _check_space(name: str, what: str, space: Any) -> None:
+    where = f"env: {name}: {what} space"
     if not isinstance(space, Box):
-        hint = " (wrap it in FlattenObservation)" if "observation" in what else ""
-        raise UsageError(f"{what}: must be a Box, got {type(space).__name__}{hint}")
+        raise UsageError(f"{where}: must be a Box, got {type(space).__name__}; {WAYS_OUT[what]}")
     if 0 in space.shape:
-        raise UsageError(f"{what}: must hold at least one number, its shape is {space.shape}")
+        raise UsageError(f"{where}: must hold at least one number, its shape is {space.shape}")
+    shapes = [np.shape(bound) for bound in (space.low, space.high)]
+    kinds = [getattr(bound, "dtype", np.dtype("O")).kind for bound in (space.low, space.high)]
+    if shapes != [space.shape] * 2 or not {*kinds} <= {*"biuf"}:
+        raise UsageError(f"{where}: its bounds must be numbers of its shape {space.shape}")
 
 
 def action_bounds(env: gymnasium.Env[Any, Any]) -> tuple[Floats, Floats]:

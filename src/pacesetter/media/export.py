@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from pacesetter.envs import Recipe
 from pacesetter.errors import unknown
 from pacesetter.media.minari import to_minari
 from pacesetter.media.onnx import to_onnx
@@ -19,7 +20,7 @@ def export(
     to: str,
     path: str | Path,
     *,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
@@ -49,7 +50,7 @@ def export(
                 f"minari.load_dataset('{path.name}')"
             )
         case "sb3":
-            file = to_sb3(policy, path, env=env)
+            file = to_sb3(policy, path, env=env.name if isinstance(env, Recipe) else env)
             return f"{path}: its `model` has SB3's predict(); it reads {file.name} beside it"
         case _:
             raise unknown("export", to, TARGETS)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import enter
 from pacesetter.media.extras import need
@@ -24,7 +24,7 @@ def to_minari(
     path: Path,
     *,
     episodes: int = 100,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
 ) -> list[float]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene
 from pacesetter.policy import Policy
@@ -23,7 +23,7 @@ def poster(
     size: tuple[int, int] = (240, 180),
     cycle: bool = False,
     camera: str | None = None,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
 ) -> list[int]:

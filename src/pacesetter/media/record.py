@@ -6,7 +6,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.media.caption import caption
 from pacesetter.media.scene import INSTALL as INSTALL
@@ -33,7 +33,7 @@ def record(
     frames: int | None = None,
     camera: str | None = None,
     size: tuple[int, int] = (640, 480),
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
     text: bool = True,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError, unknown
 from pacesetter.evaluation import enter
 from pacesetter.policy import Policy
@@ -25,7 +25,7 @@ FOLLOW, FREE = "track", "free"  # the name of MuJoCo's own models; what Gymnasiu
 @contextmanager
 def scene(
     policy: Policy,
-    env: str | None,
+    env: str | Recipe | None,
     env_kwargs: dict[str, Any] | None,
     seed: int,
     size: tuple[int, int],

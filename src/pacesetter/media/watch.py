@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from itertools import count
 from typing import Any
 
-from pacesetter.envs import Environment
+from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import enter
 from pacesetter.media.extras import need
@@ -25,7 +25,7 @@ def watch(
     browser: bool | None = None,
     episodes: int | None = None,
     port: int = 8080,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
     seed: int = 0,
 ) -> None:

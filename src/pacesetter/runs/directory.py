@@ -82,7 +82,8 @@ class RunDirectory:
 
     def resume_words(self, config: Config) -> list[str]:
         """The command that goes on with this run, with consent to what the run itself names."""
-        return ["resume", str(self.path), *words(config.run.algorithm, config.run.env)]
+        run = config.run
+        return ["resume", str(self.path), *words(run.algorithm, run.env, *run.wrap)]
 
     def difference_from(self, config: Config) -> str | None:
         """The first setting in which the run here differs; None if none does, or no run is here."""
@@ -91,7 +92,8 @@ class RunDirectory:
         old, new, own = self.settings(), config.settings(), ("algorithm", "env")
         if found := difference(old, new, own):  # a name of the file's own is not even looked up
             return found
-        return difference(self.config([new[name] for name in own]).settings(), new, new)
+        named = [*(new[name] for name in own), *old.get("wrap", ())]  # wrappers are only compared
+        return difference(self.config(named).settings(), new, new)
 
     def _refuse_other_seeds(self, config: Config) -> None:
         """Refuse a new seed whose settings differ from those of the other seeds of its name."""
@@ -188,6 +190,8 @@ class RunDirectory:
         settings = self.settings()
         for name in ("algorithm", "env"):
             require(name, settings[name], allow)
+        for wrapper in settings.get("wrap", ()):
+            require("wrap", str(wrapper), allow)
         try:
             return resolve(settings["algorithm"], settings["env"], settings)
         except KeyError as error:

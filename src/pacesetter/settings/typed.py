@@ -33,6 +33,8 @@ class RunSettings(TypedDict, total=False):
     """seed of every random stream"""
     env_timeout: float | str | None
     """longest time of a task's step or reset, such as 30s; default any"""
+    wrap: Sequence[str]
+    """wrappers around the task, module:Class, the innermost first; repeatable"""
     renew_env: bool | None
     """make the task anew at each episode, so that none depends on those before it; default..."""
     members: int

@@ -164,7 +164,8 @@ def _refuse_other_log(directory: RunDirectory, size: int, log_hash: str | None) 
 
 def _identity(config: Config) -> dict[str, Any]:
     names = ("algorithm", "env", "env_kwargs", "seed", "members")
-    return {name: getattr(config.run, name) for name in names}
+    wrap = {"wrap": [*config.run.wrap]} if config.run.wrap else {}  # which older ones do not name
+    return {name: getattr(config.run, name) for name in names} | wrap
 
 
 def _fixed(config: Config) -> Settings:

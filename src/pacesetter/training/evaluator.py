@@ -35,7 +35,7 @@ class Evaluator:
         policy = self.loop.policy(progress.champion if member is None else member)
         names = ("env", "env_kwargs", "algorithm", "name", "seed")
         policy.about.update({name: getattr(run, name) for name in names})
-        policy.about.update(renew_env=self.recipe.renew)
+        policy.about.update(wrap=[*self.recipe.wrap], renew_env=self.recipe.renew)
         policy.about.update(step=progress.step, versions=versions())
         return policy
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
 from pacesetter.config import resolve
+from pacesetter.consent import require
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
@@ -70,6 +71,8 @@ class Trainer:
         `settings` are those of `pacesetter train ALGO ENV --help`; `config` is a file of them.
         """
         layers = [read_file(Path(config), algorithm)] if config else []
+        for wrapper in layers[0].get("wrap", ()) if layers and "wrap" not in settings else ():
+            require("wrap", str(wrapper))
         self.config = resolve(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
@@ -85,6 +88,8 @@ class Trainer:
             self.directory.remove()
             raise
         self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
+        if (full := self.config.run.env) != env:
+            self.notes.insert(0, f"env: '{env}' has no version; taking the newest, {full}")
 
     @classmethod
     def resume(

@@ -87,6 +87,8 @@ def require_named(suite: Suite, allow: Collection[str], envs: Collection[str]) -
         merged = suite.shared | entry
         for env in _envs(merged["envs"]) if "envs" in merged and not envs else ():
             require("env", env, allow)
+        for wrapper in merged.get("wrap", ()):
+            require("wrap", str(wrapper), allow)
 
 
 def pick(suite: Suite, names: Iterable[str]) -> Suite:

@@ -170,7 +170,8 @@ class Tuning:
         if not present(directory.config_file):
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
-            trainer = Trainer.resume(directory.path, allow=[self.algorithm, self.env])
+            allow = [self.algorithm, self.env, *config.run.wrap]
+            trainer = Trainer.resume(directory.path, allow=allow)
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
