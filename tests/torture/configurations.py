@@ -24,11 +24,12 @@ def words_of(rng: random.Random, runs: Path) -> list[str]:
     env = PROBE if rng.random() < 0.9 else rng.choice(OTHERS)
     known = [*fields_of(Run), *fields_of(algorithms.find(name.removeprefix("multi-")).Hyper)]
     words = ["train", name if rng.random() < 0.95 else rng.choice(OTHERS), env]
-    for _ in range(rng.randrange(1, 5)):
+    for _ in range(rng.randrange(5)):
         flag = f"--{rng.choice(known).replace('_', '-')}"
         if rng.random() < 0.05:
             flag = rng.choice(["--env.gain", "--no-wait", "--env.", "--config", "--stepz"])
-        words += [f"{flag}={rng.choice(VALUES)}" if rng.random() < 0.7 else flag]
+        value = rng.choice(PLAIN if rng.random() < 0.5 else VALUES)
+        words += [f"{flag}={value}" if rng.random() < 0.7 else flag]
     return [*words, f"--runs={runs}"]
 
 

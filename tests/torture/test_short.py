@@ -20,9 +20,9 @@ def test_odd_files(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("default")
 def test_configurations(tmp_path: Path) -> None:
-    tally = configurations.run(tmp_path, 60, seed=5)
+    tally = configurations.run(tmp_path, 60, seed=6)
     assert tally.wrong == []
-    assert 20 < tally.refused < tally.made == 60
+    assert 20 < tally.refused < tally.made == 60  # some are fine
 
 
 @pytest.mark.filterwarnings("default")
