@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Container, Iterable
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import SHOWN, UsageError
 
 FLAG = "--allow"
 
@@ -26,6 +26,14 @@ def require(
         f"{kind}: a file names '{name}', which would import a module, and so run its code; "
         f"if you trust it, allow it with {FLAG} {name}"
     )
+
+
+def require_all(kind: str, names: object, allowed: Iterable[str | None] = ()) -> None:
+    """`require` for a list of names that a file gives. Raises UsageError if it is no such list."""
+    if not isinstance(names, (list, tuple)) or not all(isinstance(name, str) for name in names):
+        raise UsageError(f"{kind}: must be a list of names, got {str(names)[:SHOWN]}")
+    for name in names:
+        require(kind, str(name), allowed)
 
 
 def words(*names: str) -> list[str]:

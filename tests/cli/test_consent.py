@@ -186,3 +186,22 @@ def test_a_program_that_uses_the_module_already(made: RunDirectory, here: Path) 
     assert intruder.Learner
     run = trap(made, here, algorithm="td3", env="broken_envs:Probe-v0")
     Trainer.resume(run.path).close()
+
+
+@pytest.mark.parametrize("wrap", ['["intruder:Learner"]', "5", "[5]"])
+def test_a_wrapper_that_a_file_names(
+    wrap: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a config, in a suite, and in the config file of a suite's entry."""
+    Path("mine.toml").write_text(f"wrap = {wrap}\n")
+    text = SUITE.format(algorithm="td3", env="Pendulum-v1")
+    Path("one.toml").write_text(f"wrap = {wrap}\n{text}")
+    Path("two.toml").write_text(f'{text}config = "mine.toml"\n')
+    printed = ["--print", "commands"]
+    train = ["train", "td3", "Pendulum-v1", "--config", "mine.toml"]
+    for words in (train, ["bench", "one.toml", *printed], ["bench", "two.toml", *printed]):
+        assert main(words) == 2, words
+        line = capsys.readouterr().err
+        assert "wrap: " in line
+        assert line.count("\n") == 1
+    assert "intruder" not in sys.modules

@@ -41,6 +41,7 @@ def _parse(words: list[str]) -> tuple[Suite, Settings, dict[str, Any]]:
     suite = _suite(name, first.algos) if name or first.algos else None
     if suite is not None:
         named = [*first.allow, *(first.algos or [])]
+        suite = suite._replace(allow=named)
         suites.require_named(suite, named, vars(first).get("envs", []))
         _add_settings_of(suite, command)
     found = vars(command.parse(rest))

@@ -27,6 +27,7 @@ class _Settings(BaseModel):
     eval_every: Positive
     eval_episodes: Positive = 1
     env_kwargs: dict[str, Any] = {}
+    wrap: list[str] = []
 
 
 class Record(BaseModel):

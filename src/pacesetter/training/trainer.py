@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
 from pacesetter.config import resolve
-from pacesetter.consent import require
+from pacesetter.consent import require_all
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
@@ -71,8 +71,8 @@ class Trainer:
         `settings` are those of `pacesetter train ALGO ENV --help`; `config` is a file of them.
         """
         layers = [read_file(Path(config), algorithm)] if config else []
-        for wrapper in layers[0].get("wrap", ()) if layers and "wrap" not in settings else ():
-            require("wrap", str(wrapper))
+        if layers and "wrap" not in settings:
+            require_all("wrap", layers[0].get("wrap", ()))
         self.config = resolve(algorithm, env, *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pacesetter.config import Config, resolve
-from pacesetter.consent import require
+from pacesetter.consent import require, require_all
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
@@ -28,6 +28,7 @@ class Suite(NamedTuple):
     shared: Settings
     entries: dict[str, Settings]
     folder: Path  # in which config files of entries are looked for
+    allow: Collection[str] = ()  # names in its files that may import a module
 
 
 class Job(NamedTuple):
@@ -87,8 +88,7 @@ def require_named(suite: Suite, allow: Collection[str], envs: Collection[str]) -
         merged = suite.shared | entry
         for env in _envs(merged["envs"]) if "envs" in merged and not envs else ():
             require("env", env, allow)
-        for wrapper in merged.get("wrap", ()):
-            require("wrap", str(wrapper), allow)
+        require_all("wrap", merged.get("wrap", ()), allow)
 
 
 def pick(suite: Suite, names: Iterable[str]) -> Suite:
@@ -116,6 +116,8 @@ def expand(
             for env in _envs(merged.get("envs")):
                 below = _file(suite, merged.get("config"), env)
                 own = {**suite.shared, **below, **_for_env(entry, env), **flags}
+                if "wrap" not in flags:
+                    require_all("wrap", own.get("wrap", ()), suite.allow)
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
