@@ -24,7 +24,7 @@ def log(directory: RunDirectory) -> list[dict[str, Any]]:
 
 
 def content(directory: RunDirectory) -> dict[str, Any]:
-    """All that a finished run holds but settings and clocks: arrays, counters, streams, rows, log."""
+    """All that a finished run holds but settings and clocks: arrays, counters, streams, log."""
     arrays, table = storage.read(directory.state_file, "checkpoint")
     table["progress"] = {k: v for k, v in table["progress"].items() if k not in CLOCKS}
     del table["log"], table["log_hash"], table["settings"]
