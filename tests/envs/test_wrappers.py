@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from broken_envs import Probe
 from short_runs import TINY, assert_same, log, run_to_end, run_to_step
 
 from pacesetter.cli.main import main
@@ -110,3 +111,24 @@ def test_wrappers_from_a_file_are_not_imported_unasked(
     policy.save(directory.policy_file)
     assert main(["eval", str(directory.policy_file), "--episodes", "1"]) == 2
     assert "wrap: a file names 'evil_module:Wrapper'" in capsys.readouterr().err
+
+
+def test_function_in_the_place_of_an_id(tmp_path: Path) -> None:
+    """The run is the same as by the id, and resumes when the function is given again."""
+
+    def make_probe(gain: float = 1.0) -> Any:
+        return Probe(gain)
+
+    def same_probe() -> Any:
+        return one
+
+    one = Probe()
+    by_id = run_to_end(Trainer("td3", PROBE, runs=tmp_path, **RUN))
+    parts = run_to_step(Trainer("td3", make_probe, runs=tmp_path, **RUN), 120)
+    assert parts.path == tmp_path / "function-make_probe" / "td3" / "0"
+    with pytest.raises(UsageError, match="was given as a function; give it again"):
+        Trainer.resume(parts.path)
+    assert log(run_to_end(Trainer.resume(parts.path, env=make_probe))) == log(by_id)
+    for function, why in ((same_probe, "new env at each call"), (dict, "must give an env")):
+        with pytest.raises(UsageError, match=why):
+            Trainer("td3", function, runs=tmp_path, **RUN)

@@ -59,6 +59,8 @@ SAID_ON_RESUME = {
 
 def choose(recipe: Recipe, renew: bool | None) -> Apart:
     """As is wished, or by a test, which makes the task some times more."""
+    if recipe.factory is not None:
+        _refuse_shared(recipe)
     if renew is not None:
         return Apart.BY_RENEWAL if renew else Apart.UNTESTED
     if _resets_wholly(recipe.name) and not recipe.wrap:
@@ -74,6 +76,15 @@ def choose(recipe: Recipe, renew: bool | None) -> Apart:
         return Apart.BY_RESET
     repeats = _play_in_new(recipe, number) == _play_in_new(recipe, number)
     return Apart.BY_RENEWAL if repeats else Apart.NOT
+
+
+def _refuse_shared(recipe: Recipe) -> None:
+    """Refuse a function that gives the same env twice: members and evaluations have their own."""
+    one, other = recipe.make(), recipe.make()
+    if one.unwrapped is other.unwrapped:
+        raise UsageError(f"env: {recipe.name} must give a new env at each call, not the same one")
+    one.close()
+    other.close()
 
 
 def _resets_wholly(name: str) -> bool:

@@ -1,7 +1,9 @@
 """Gymnasium tasks by their id: made, wrapped, and refused where no learner could use them."""
 
 import logging
+import re
 import warnings
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
@@ -15,6 +17,8 @@ from pacesetter.envs.wrappers import Env, flattened, wrapped
 from pacesetter.errors import TaskError, UsageError
 from pacesetter.settings import Settings
 
+Factory = Callable[..., Env]
+FUNCTION = "function/"  # begins the name of a task that a function makes
 FIND = "; its folder must be the current one or in PYTHONPATH"
 
 
@@ -36,6 +40,14 @@ def make_quietly(name: str, kwargs: Settings) -> Env:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
 
 
+def name_of(env: str | Factory) -> str:
+    """The id, or a name for what a function makes."""
+    if isinstance(env, str):
+        return env
+    own = getattr(env, "__name__", type(env).__name__)
+    return FUNCTION + (re.sub(r"\W", "", own) or "env")
+
+
 @dataclass(frozen=True)
 class Recipe:
     """How a task is made, as often as it is needed: its Gymnasium id, keywords and wrappers."""
@@ -45,6 +57,7 @@ class Recipe:
     wrap: tuple[str, ...] = ()  # module:Class, the innermost first
     renew: bool = False  # make it anew at each episode
     timeout: float | None = None  # seconds that a call into it may take
+    factory: Factory | None = None  # gives a new env at each call, in the place of the id
 
     def make(self) -> Env:
         """A new env with Box spaces. Raises UsageError if the id or the task is wrong."""
@@ -54,6 +67,21 @@ class Recipe:
         return env
 
     def _bare(self) -> Env:
+        return self._registered() if self.factory is None else self._from(self.factory)
+
+    def _from(self, factory: Factory) -> Env:
+        try:
+            failed = f"env: cannot make '{self.name}'"
+            env: object = call(failed, self.timeout, factory, **self.kwargs)
+        except TaskError as error:
+            raise UsageError(str(error)) from None
+        if not isinstance(env, gymnasium.Env):
+            raise UsageError(f"env: {self.name} must give an env, got a {type(env).__name__}")
+        return env
+
+    def _registered(self) -> Env:
+        if self.name.startswith(FUNCTION):
+            raise UsageError(f"env: '{self.name}' was given as a function; give it again, as env=")
         name = full_id(self.name)
         refuse_unknown(name)
         try:

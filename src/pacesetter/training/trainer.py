@@ -13,6 +13,7 @@ from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
 from pacesetter.envs import Environment, apart
 from pacesetter.envs.apart import Apart
+from pacesetter.envs.tasks import Factory, name_of
 from pacesetter.errors import TaskError, TrainingError, UsageError
 from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
@@ -39,7 +40,7 @@ class Trainer:
     def __init__(
         self,
         algorithm: "Name",
-        env: str,
+        env: str | Factory,
         *,
         runs: str | Path = "runs",
         config: str | Path | None = None,
@@ -50,7 +51,7 @@ class Trainer:
     def __init__(
         self,
         algorithm: str,
-        env: str,
+        env: str | Factory,
         *,
         runs: str | Path = "runs",
         config: str | Path | None = None,
@@ -60,7 +61,7 @@ class Trainer:
     def __init__(
         self,
         algorithm: str,
-        env: str,
+        env: str | Factory,
         *,
         runs: str | Path = "runs",
         config: str | Path | None = None,
@@ -68,16 +69,17 @@ class Trainer:
     ) -> None:
         """Check everything, then make the run's folder below `runs`.
 
-        `settings` are those of `pacesetter train ALGO ENV --help`; `config` is a file of them.
+        `env` is an id, or a function that gives a new env at each call. `settings` are those of
+        `pacesetter train ALGO ENV --help`; `config` is a file of them.
         """
         layers = [read_file(Path(config), algorithm)] if config else []
         if layers and "wrap" not in settings:
             require_all("wrap", layers[0].get("wrap", ()))
-        self.config = resolve(algorithm, env, *layers, settings)
+        self.config = resolve(algorithm, name_of(env), *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
-        self._begin(None)
+        self._begin(None, env)
         if self.config.run.start_from is not None:
             start_from(self.loop, self.config, runs)
         self.directory.create(self.config, **self._made_with())
@@ -88,7 +90,7 @@ class Trainer:
             self.directory.remove()
             raise
         self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
-        if (full := self.config.run.env) != env:
+        if (full := self.config.run.env) != env and isinstance(env, str):
             self.notes.insert(0, f"env: '{env}' has no version; taking the newest, {full}")
 
     @classmethod
@@ -101,10 +103,12 @@ class Trainer:
         time: float | str | None = None,
         stop_at: float | None = None,
         allow: Iterable[str] = (),
+        env: Factory | None = None,
     ) -> Self:
         """Take up a run where its last checkpoint left it, with a new budget if one is given.
 
-        `allow` are names in its config that may import a module.
+        `allow` are names in its config that may import a module; `env` is the function that made
+        its envs, if one did.
         """
         self = cls.__new__(cls)
         self.directory = find(str(run), runs)
@@ -116,7 +120,7 @@ class Trainer:
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
         checkpoint.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
-        self._begin(apart.recorded(self.directory.record()))
+        self._begin(apart.recorded(self.directory.record()), env)
         self.directory.lock()
         try:
             self.directory.sweep()
@@ -137,12 +141,13 @@ class Trainer:
         done = f"{self.progress.step:,} of {self.budget:,} steps"
         return f"Trainer({run.name} on {run.env}, seed {run.seed}: {done}, {self.directory.path})"
 
-    def _begin(self, before: Apart | None) -> None:
+    def _begin(self, before: Apart | None, env: str | Factory | None) -> None:
         """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
         run, hyper = self.config
         on_policy = isinstance(hyper, OnPolicy)
-        self.apart = before or apart.choose(self.config.recipe, run.renew_env)
-        recipe = replace(self.config.recipe, renew=self.apart is Apart.BY_RENEWAL)
+        recipe = replace(self.config.recipe, factory=env if callable(env) else None)
+        self.apart = before or apart.choose(recipe, run.renew_env)
+        recipe = replace(recipe, renew=self.apart is Apart.BY_RENEWAL)
         envs = [
             Environment(recipe, run.seed, Stream.TRAIN, index)
             for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
