@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
@@ -10,8 +9,8 @@ from pacesetter.config import resolve
 from pacesetter.consent import require_all
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
-from pacesetter.ensemble.progress import TRAIN_ROW_EVERY, Clock, Progress
-from pacesetter.envs import Environment, apart
+from pacesetter.ensemble.progress import Progress
+from pacesetter.envs import apart
 from pacesetter.envs.apart import Apart
 from pacesetter.envs.tasks import Factory, name_of
 from pacesetter.errors import TaskError, TrainingError, UsageError
@@ -19,15 +18,16 @@ from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
-from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import is_reached, out_of_time
 from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint
-from pacesetter.training.evaluator import Evaluator, Stopped
+from pacesetter.training.evaluator import Evaluator
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
+from pacesetter.training.reporter import Reporter
 from pacesetter.training.starting import start_from
+from pacesetter.training.tasks import make_tasks
 
 if TYPE_CHECKING:
     from pacesetter.settings.typed import Name, RunSettings
@@ -82,7 +82,7 @@ class Trainer:
         self._begin(None, env)
         if self.config.run.start_from is not None:
             start_from(self.loop, self.config, runs)
-        self.directory.create(self.config, **self._made_with())
+        self.directory.create(self.config, **self._made_with)
         try:
             self.loop.open_replays(self.directory.state_file.parent)
             checkpoint.save(self.loop, self.config, self.directory)
@@ -114,8 +114,7 @@ class Trainer:
         self.directory = find(str(run), runs)
         self.config = self.directory.config(allow)
         budgets = {"steps": steps, "time": time, "stop_at": stop_at}
-        changed = {key: value for key, value in budgets.items() if value is not None}
-        if changed:
+        if changed := {key: value for key, value in budgets.items() if value is not None}:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
         checkpoint.refuse_other_settings(self.config, self.directory)
@@ -128,9 +127,8 @@ class Trainer:
             notes = checkpoint.restore(self.loop, self.config, self.directory)
             self.notes += [*self.directory.notes, *notes]
             if self.progress.step > self.budget:
-                made = f"{self.progress.step:,}"
-                raise UsageError(f"steps: the run has made {made} already; give more")
-            self.directory.note_resume(self.config, self.progress.step, **self._made_with())
+                raise UsageError(f"steps: the run has made {self.progress.step:,}; give more")
+            self.directory.note_resume(self.config, self.progress.step, **self._made_with)
         except BaseException:
             self.directory.unlock()
             raise
@@ -143,52 +141,41 @@ class Trainer:
 
     def _begin(self, before: Apart | None, env: str | Factory | None) -> None:
         """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
-        run, hyper = self.config
-        on_policy = isinstance(hyper, OnPolicy)
-        recipe = replace(self.config.recipe, factory=env if callable(env) else None)
-        self.apart = before or apart.choose(recipe, run.renew_env)
-        recipe = replace(recipe, renew=self.apart is Apart.BY_RENEWAL)
-        envs = [
-            Environment(recipe, run.seed, Stream.TRAIN, index)
-            for index in range(hyper.parallel_envs if on_policy else run.members * hyper.num_envs)
-        ]
-        cast = envs[0].check()
-        self.notes += [] if before else cast
-        self.notes += apart.notes(self.apart, run.env, resumed=before is not None)
-        self.loop: Loop = (OnPolicyLoop if on_policy else Members)(self.config, envs)
-        self._evaluator = Evaluator(self.loop, self.config, self.directory, recipe)
-        self._reports: list[Report] = []
+        tasks = make_tasks(self.config, before, env if callable(env) else None)
+        self.apart = tasks.apart
+        self._made_with = {"apart": self.apart, **made_with(products.of(self.config.hyper))}
+        self.notes += tasks.notes
+        kind = OnPolicyLoop if isinstance(self.config.hyper, OnPolicy) else Members
+        self.loop: Loop = kind(self.config, tasks.envs)
+        self._evaluator = Evaluator(self.loop, self.config, self.directory, tasks.recipe)
+        self._reporter = Reporter(self.loop, self.config, self.directory, self._evaluator)
         self._stopping = self._closed = False
-        self._clock = Clock()
-
-    def _made_with(self) -> dict[str, Any]:
-        return {"apart": self.apart, **made_with(products.of(self.config.hyper))}
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""
         self._refuse_closed()
-        self._clock = Clock()
+        self._reporter.start_clock()
         self._saved_at = self.progress.wall_seconds
         try:
             while True:
-                self._clock.tell(self.progress)
+                self._reporter.tell_time()
                 ending = self._spent
-                self._report_what_is_due(ending)
-                reports, self._reports = self._reports, []
-                yield from reports
+                yield from self._reporter.due(ending)
                 if ending or self._stopping or self._reached:
                     break
                 if self._save_is_due():
                     self.save()
                 selection = self.loop.tick()
                 if selection is not None:
-                    self._emit("select", selection.row())
+                    self._reporter.add("select", selection.row())
             self.save()
         except GeneratorExit:
             self.save()
             raise
         except TaskError:
-            self._save_if_whole()
+            if self.loop.whole:
+                with suppress(TrainingError, OSError):  # the task's error is the one to be seen
+                    self.save()
             raise
         except OSError as error:
             where = f"step {self.progress.step}: {self.directory.path}"
@@ -224,24 +211,16 @@ class Trainer:
         return is_reached(vars(self.config.run), self.progress.best)
 
     def stop(self) -> None:
-        """Ask for the end after the running tick, or within an evaluation, which a resumed run
-        makes again; may be called from a signal handler.
-        """
+        """Ask for the end, in a tick or an evaluation at most; a signal handler may call it."""
         self._stopping = True
         self._evaluator.stop()
 
     def save(self) -> None:
         """Write a checkpoint now."""
         self._refuse_closed()
-        self._clock.tell(self.progress)
+        self._reporter.tell_time()
         checkpoint.save(self.loop, self.config, self.directory)
         self._saved_at = self.progress.wall_seconds
-
-    def _save_if_whole(self) -> None:
-        """After a fault of the task, whose error is the one to be seen."""
-        if self.loop.whole:
-            with suppress(TrainingError, OSError):
-                self.save()
 
     def close(self) -> None:
         """Let go of envs, files and the folder."""
@@ -265,34 +244,7 @@ class Trainer:
 
     def ledger(self) -> dict[str, Any]:
         """What the run has spent."""
-        progress = self.progress
-        return progress.ledger() | self.loop.learners.ledger(progress.updates, progress.actions)
-
-    # What is due: evaluations, rows of the log, checkpoints.
-
-    def _report_what_is_due(self, ending: bool) -> None:
-        progress = self.progress
-        pending = ending and bool(progress.ended or progress.losses)
-        if progress.step >= progress.next_train or pending:
-            progress.next_train = (progress.step // TRAIN_ROW_EVERY + 1) * TRAIN_ROW_EVERY
-            self._emit("train", self.loop.training_values())
-        last = ending and progress.last_evaluation < progress.step
-        # The last one waits for all updates that the budget's last steps made due.
-        if (progress.step >= progress.next_evaluation and progress.step < self.budget) or last:
-            try:
-                values = self._evaluator.evaluate(ending)
-            except Stopped:
-                return
-            self._emit("eval", values)
-            every = self.config.run.eval_every * self.config.steps_per_count
-            progress.last_evaluation = progress.step
-            progress.next_evaluation = (progress.step // every + 1) * every
-
-    def _emit(self, kind: str, values: dict[str, Any]) -> None:
-        self._clock.tell(self.progress)
-        report = Report(kind, self.progress.step, values, self.ledger())
-        self.directory.log.append(report.row())
-        self._reports.append(report)
+        return self._reporter.ledger()
 
     def _save_is_due(self) -> bool:
         waited = self.progress.wall_seconds - self._saved_at
