@@ -82,7 +82,7 @@ def test_train_prints_a_name_that_finds_the_run(
 def test_what_is_near_is_not_called_allowed(capsys: pytest.CaptureFixture[str]) -> None:
     """Any task may be trained on: only near ones are named, or where to see them all."""
     for typed, said in (
-        ("dm_control/cheetah-run-v0", "see `pacesetter list envs`"),
+        ("nowhere/cheetah-run-v0", "see `pacesetter list envs`"),
         ("HalfCheeta-v5", "did you mean HalfCheetah-v5"),
     ):
         assert main(["train", "td3", typed]) == 2

@@ -428,7 +428,7 @@ def test_every_flag_is_tried() -> None:
     """A new setting needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
     settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
-    own_tests = {"start_from"}  # needs a run that is there
+    own_tests = {"start_from", "wrap"}  # which need a run, and a module of wrappers
     assert settings - tried == {"algorithm", "env", "env_kwargs"} | own_tests
 
 

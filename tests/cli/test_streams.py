@@ -176,9 +176,9 @@ def test_json_has_no_number_that_json_has_not() -> None:
 
 def test_rows_of_the_log_are_strict(here: Path) -> None:
     directory = RunDirectory(here)
-    directory.append({"kind": "train", "loss": float("nan")})
+    directory.log.append({"kind": "train", "step": 0, "loss": float("nan")})
     text = directory.metrics_file.read_text()
-    assert json.loads(text, parse_constant=refuse) == {"kind": "train", "loss": None}
-    directory.metrics_file.write_text('{"kind": "train", "loss": NaN}\n')
+    assert json.loads(text, parse_constant=refuse) == {"kind": "train", "step": 0, "loss": None}
+    directory.metrics_file.write_text('{"kind": "train", "step": 0, "loss": NaN}\n')
     (old,) = directory.rows()
     assert old["loss"] != old["loss"]

@@ -107,7 +107,8 @@ def test_card_says_what_it_is(folder: Path, file: Path) -> None:
 
 
 def test_command_is_that_of_the_run_folder_and_a_film_is_played(folder: Path, file: Path) -> None:
-    settings = {"algorithm": "td3", "env": "Pendulum-v1"}
+    settings = {"algorithm": "td3", "env": "Pendulum-v1", "name": "td3", "seed": 0}
+    settings |= {"steps": 1000, "eval_every": 100}
     record = {"schema": 1, "threads": 2, "settings": settings, "command": "pacesetter train it"}
     (file.parent / "config.json").write_text(json.dumps(record))
     film = file.with_name("film.mp4")

@@ -51,13 +51,10 @@ def _watchdog() -> Watchdog:
 
 
 @contextmanager
-def limited(seconds: float | None, what: str) -> Generator[None]:
+def limited(seconds: float, what: str) -> Generator[None]:
     """Raise Overdue in a call of the main thread that takes longer; end the process if that does
     not wake it, or if the call is of another thread.
     """
-    if seconds is None:
-        yield
-        return
     dog, wakes = _watchdog(), threading.current_thread() is threading.main_thread()
     dog.said = f"{what}: it has not returned after {seconds:g} s and cannot be woken"
     dog.due = monotonic() + seconds + GRACE
