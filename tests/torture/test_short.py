@@ -10,7 +10,11 @@ import swapped
 from attempts import Tally, attempt, command
 
 
-@pytest.mark.filterwarnings("default")  # as in a command; NumPy warns where it is used in tests
+@pytest.mark.filterwarnings(
+    "default",  # as in a command
+    "ignore:overflow encountered in matmul:RuntimeWarning",  # of weights that were made huge
+    "ignore:invalid value encountered in matmul:RuntimeWarning",
+)
 def test_odd_files(tmp_path: Path) -> None:
     tally = odd_files.run(tmp_path, odd_files.KINDS, each=12, seed=5)
     assert tally.wrong == []
