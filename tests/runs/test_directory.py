@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from odd_places import folder, pipe
 from short_runs import TINY, assert_same, log, run_to_end
 
 from pacesetter import storage
@@ -146,17 +147,6 @@ def link(path: Path) -> None:
     other.write_bytes(b"untouched")
     path.unlink()
     path.symlink_to(other)
-
-
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-    (path / "inside").write_text("a user's own")
 
 
 ODD = (link, pipe, folder)

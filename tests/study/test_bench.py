@@ -16,6 +16,7 @@ from typing import Any
 import broken_envs
 import numpy as np
 import pytest
+from odd_places import folder, pipe
 from short_runs import assert_same
 
 from pacesetter import algorithms
@@ -436,16 +437,6 @@ def test_a_run_in_use_by_nobody_is_not_tried_for_ever(jobs: list[Job]) -> None:
     work = run(jobs[:1], executor := Here(*[lambda words: Outcome(75, "in use")] * 9))
     assert len(executor.calls) == 3
     assert work.failed == {str(jobs[0]): "exit 75: in use"}
-
-
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
 
 
 DAMAGES: dict[str, Callable[[Path], object]] = {

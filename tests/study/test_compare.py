@@ -21,8 +21,9 @@ from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import lineage, stats
 from pacesetter.study.compare.comparison import compare
+from pacesetter.study.compare.gathering import gather
 from pacesetter.study.compare.groups import split
-from pacesetter.study.compare.results import compact, gather
+from pacesetter.study.compare.results import compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
 

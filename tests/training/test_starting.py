@@ -14,7 +14,7 @@ from pacesetter import policy
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
 from pacesetter.study.bench.queue import Job, is_finished
-from pacesetter.study.compare.results import gather
+from pacesetter.study.compare.gathering import gather
 from pacesetter.training.trainer import Trainer
 
 ENV = "Pendulum-v1"

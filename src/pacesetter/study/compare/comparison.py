@@ -15,8 +15,9 @@ from pacesetter.settings import STRICT
 from pacesetter.settings.validation import build
 from pacesetter.settings.values import Count, Duration
 from pacesetter.study.compare import stats
+from pacesetter.study.compare.gathering import gather
 from pacesetter.study.compare.groups import CONTROL, METRICS, Comparison, Group, split
-from pacesetter.study.compare.results import Run, gather
+from pacesetter.study.compare.results import Run
 
 # `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
 _FREE = FREE_PER_SEED - {"replay_horizon", "lr_horizon"}
