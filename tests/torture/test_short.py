@@ -1,9 +1,11 @@
 """The short form of every experiment; `make torture` and `make torture-long` run the long ones."""
 
+from datetime import date
 from pathlib import Path
 
 import configurations
 import odd_files
+import page
 import processes
 import pytest
 import swapped
@@ -58,3 +60,17 @@ def test_an_attempt_sees_what_goes_wrong(tmp_path: Path) -> None:
     attempt(tally, "a success", command("--version"))
     assert [each.split(":")[1] for each in tally.wrong] == [" traceback", " code run"]
     assert (tally.made, tally.refused) == (4, 1)
+
+
+def test_a_new_row_leaves_the_others(tmp_path: Path) -> None:
+    """Rows of experiments that are no more go; what stands around the table stays."""
+    file = tmp_path / "page.md"
+    rows = ["| a | 0 | 1 | yes | 2026-01-01 |", "| old | 0 | 1 | yes | 2026-01-01 |"]
+    file.write_text("\n".join(["# Page", page.BEGIN, *page.HEAD, *rows, page.END, "after"]))
+    page.write(file, page.row("b", "0", "2", met=False), order=["b", "c", "a"])
+    before, table = file.read_text().split(page.BEGIN)
+    table, after = table.split(page.END)
+    assert (before, after) == ("# Page\n", "\nafter")
+    new, kept = table.strip().splitlines()[2:]
+    assert new == f"| b | 0 | 2 | NO | {date.today()} |"
+    assert kept == rows[0]
