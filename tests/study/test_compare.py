@@ -55,9 +55,10 @@ def small(folder: Path, env: str = "Ant-v5", name: str = "td3", seed: int = 0, *
 
 def test_runs_are_found_by_folder_tail_pattern_and_file(runs: Path, tmp_path: Path) -> None:
     def names(*words: str) -> list[str]:
-        found, empty = gather(words, runs)
-        assert not empty
-        return sorted(f"{run.env}/{run.name}/{run.seed}" for run in found)
+        found = gather(words, runs)
+        assert not found.empty
+        assert not found.damaged
+        return sorted(f"{run.env}/{run.name}/{run.seed}" for run in found.runs)
 
     td3 = [f"HalfCheetah-v5/td3/{seed}" for seed in range(5)]
     assert names(str(runs / "HalfCheetah-v5" / "td3")) == td3
@@ -106,8 +107,57 @@ def test_a_foreign_line_is_refused(
     line = {key: value for key, value in line.items() if value is not ...}
     file = tmp_path / "results.jsonl"
     file.write_text(json.dumps(line) + "\n")
-    with pytest.raises(UsageError, match=said):
-        gather([file])
+    (why,) = gather([file]).damaged
+    assert re.search(said, why)
+    with pytest.raises(UsageError, match=f"none can be read: .*{said}"):
+        compare([file])
+
+
+def _no_config(run: RunDirectory) -> None:
+    run.config_file.unlink()
+    run.config_file.mkdir()
+
+
+DAMAGES: dict[str, Callable[[RunDirectory], object]] = {
+    "config": lambda run: run.config_file.write_text("{"),
+    "config a folder": _no_config,
+    "log cut": lambda run: run.metrics_file.write_text('{"kind": "eval", "st\n'),
+    "log of bytes": lambda run: run.metrics_file.write_bytes(b"\xff\xfe\n"),
+    "row without a step": lambda run: run.metrics_file.write_text('{"kind": "eval"}\n'),
+    "steps that fall": lambda run: run.metrics_file.write_text(
+        "".join(reversed(run.metrics_file.read_text().splitlines(keepends=True)))
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_run_is_left_out(
+    damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The others are compared, and a line says what is left out; alone it is refused."""
+    whole, broken = small(tmp_path / "runs"), small(tmp_path / "runs", seed=1)
+    DAMAGES[damage](RunDirectory(broken))
+    for words in (["td3"], [str(whole), str(broken)], ["Ant-*/t*"]):
+        assert main(["compare", *words, "-o", "table.md"]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("pacesetter: left out: ")
+        assert str(broken) in line or "Ant-v5/td3/1" in line
+        assert "Left out: " in Path("table.md").read_text()
+    Path("table.md").unlink()
+    assert main(["compare", str(broken), "-o", "table.md"]) == 2
+    assert capsys.readouterr().err.startswith("pacesetter: run: none can be read: ")
+    assert not Path("table.md").exists()
+
+
+def test_a_damaged_line_of_results_is_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [json.dumps(compact(RunDirectory(small(tmp_path, seed=seed)))) for seed in (0, 1)]
+    Path("r.jsonl").write_bytes(f"{lines[0]}\n{{\n{lines[1]}\n".encode() + b"\xff\n")
+    assert main(["compare", "r.jsonl"]) == 0
+    said = capsys.readouterr()
+    assert [line.split(": ")[2] for line in said.err.splitlines()] == ["r.jsonl:2", "r.jsonl:4"]
+    assert "n=2" in said.out
 
 
 # What may stand side by side.
@@ -212,7 +262,7 @@ def test_evaluations_count_at_the_steps_at_which_they_were_due(tmp_path: Path) -
         row["step"] += row["step"] == 8_000
     rows.append([row for row in rows if row["kind"] == "eval"][-1] | {"step": 10_500})
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (run,) = gather([path])[0]
+    (run,) = gather([path]).runs
     assert run.clock.tolist() == [0, 2_000, 4_000, 6_000, 8_000, 10_000, 10_500]
     assert run.steps[4] == 8_001
     assert run.finished
@@ -274,7 +324,7 @@ def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path
         if row["kind"] == "eval" and row["step"] <= 25_000:
             row["returns"] = [1_001.0]
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    (run,) = gather([path])[0]
+    (run,) = gather([path]).runs
     assert run.metric("max") < 800
     assert run.reached(1_000) == math.inf
 

@@ -15,7 +15,7 @@ from compare import make_run
 from policies import untrained
 
 from pacesetter.cli.main import main
-from pacesetter.errors import UsageError
+from pacesetter.errors import TaskError, UsageError
 from pacesetter.media.record import INSTALL
 from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import stats
@@ -283,11 +283,12 @@ def test_the_champions_film_is_in_the_page(runs: Path, tmp_path: Path) -> None:
     assert "the policy of step 100,000" in text
 
 
+@pytest.mark.parametrize("kind", [UsageError, TaskError])
 def test_a_page_without_a_film_says_why_in_one_line(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: type[Exception], runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*words: Any, **more: Any) -> int:
-        raise UsageError(f"video: no OpenGL to draw with; {INSTALL}")
+        raise kind(f"video: no OpenGL to draw with; {INSTALL}")
 
     run = shutil.copytree(runs / "Walker2d-v5", tmp_path / "runs" / "Walker2d-v5")
     for config in run.rglob("config.json"):

@@ -121,7 +121,7 @@ def test_a_run_stops_at_the_evaluation_that_reaches_the_return(runs: Path) -> No
     assert short.progress.step == rows[-1]["step"] == (first + 1) * 100
     assert [row["mean"] for row in rows[1:]] == means[: first + 1]
     assert is_finished(Job(short.config, short.directory, []))
-    (seen,), _ = gather([short.directory.path])
+    (seen,) = gather([short.directory.path]).runs
     assert seen.finished
 
 

@@ -1,5 +1,7 @@
 """The verb `compare`."""
 
+import sys
+
 from pacesetter.cli.flags import Parser, parser
 
 
@@ -20,6 +22,8 @@ def compare(words: list[str]) -> int:
         reference=found.reference,
         mixed=found.mixed,
     )
+    for why in comparison.damaged:
+        print(f"pacesetter: left out: {why}", file=sys.stderr)
     for path in paths:
         output.write(comparison, path, options)
         print(path)

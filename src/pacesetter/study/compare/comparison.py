@@ -15,7 +15,7 @@ from pacesetter.settings import STRICT
 from pacesetter.settings.validation import build
 from pacesetter.settings.values import Count, Duration
 from pacesetter.study.compare import stats
-from pacesetter.study.compare.gathering import gather
+from pacesetter.study.compare.gathering import Gathered, gather
 from pacesetter.study.compare.groups import CONTROL, METRICS, Comparison, Group, split
 from pacesetter.study.compare.results import Run
 
@@ -54,21 +54,22 @@ def compare(
     if budget is not None and cpu is not None:
         raise UsageError("cpu: limits runs otherwise than --budget does; give one of the two")
     limit = build(Limit, {"budget": budget, "cpu": cpu})
-    found, empty = gather(runs, below)
-    kept, notes = _complete(found, empty, limit)
+    found = gather(runs, below)
+    kept, notes = _complete(found, limit)
     _refuse_twins(kept)
     notes += _mixtures(kept, mixed, limit)
     kept.sort(key=lambda run: (run.env, run.name, run.seed, run.budget))
     grouped = groupby(kept, lambda run: (run.env, run.name))
     groups = [Group(env, name, list(same)) for (env, name), same in grouped]
-    return Comparison(groups, metric, reference, notes + _remarks(groups, kept, limit))
+    notes += _remarks(groups, kept, limit)
+    return Comparison(groups, metric, reference, notes, found.damaged)
 
 
-def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Run], list[str]]:
-    """The runs that made their budget, cut at the limit, and a note for those that did not."""
+def _complete(found: Gathered, limit: Limit) -> tuple[list[Run], list[str]]:
+    """The runs that made their budget, cut at the limit, and notes on those that are left out."""
     kept: list[Run] = []
-    out = [f"{source} (no evaluation)" for source in empty]
-    for run in found:
+    out = [f"{source} (no evaluation)" for source in found.empty]
+    for run in found.runs:
         if short := _short_of(run, limit):
             out.append(f"{run.source} ({short})")
             continue
@@ -80,10 +81,14 @@ def _complete(found: list[Run], empty: list[str], limit: Limit) -> tuple[list[Ru
             kept.append(run)
         else:
             out.append(f"{run.source} (no evaluation up to {limit})")
+    if not kept and found.damaged and not out:
+        raise UsageError(f"run: none can be read: {'; '.join(found.damaged[:3])}")
     if not kept:
-        reason = f": {'; '.join(out[:3])}" if out else ""
+        few = [*out[:3], *found.damaged[:3]]
+        reason = f": {'; '.join(few)}" if few else ""
         raise UsageError(f"run: none is complete{reason}; limit all with --budget, or resume them")
-    return kept, [f"Left out as incomplete: {', '.join(out)}."] if out else []
+    notes = [f"Left out as incomplete: {', '.join(out)}."] if out else []
+    return kept, notes + [f"Left out: {why}." for why in found.damaged]
 
 
 def _short_of(run: Run, limit: Limit) -> str | None:

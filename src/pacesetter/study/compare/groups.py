@@ -1,7 +1,7 @@
 """Runs in groups that differ by seed only: the data of every table, figure and page."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -58,12 +58,16 @@ class Group:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The groups, the metric, the control, and what a reader must be told."""
+    """The groups, the metric, the control, and what a reader must be told.
+
+    `damaged` says why each run that could not be read is left out.
+    """
 
     groups: list[Group]
     metric: str
     reference: str
     notes: list[str]
+    damaged: list[str] = field(default_factory=list[str])
 
     @property
     def envs(self) -> list[str]:

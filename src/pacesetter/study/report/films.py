@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import TrainingError, UsageError
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import Run
 
@@ -44,7 +44,7 @@ def _film(run: Run, allow: Collection[str]) -> Film:
             env = own if own in allow else None
             record(policy, path, env=env, frames=FILM_FRAMES, size=FILM_SIZE)
             data = base64.b64encode(path.read_bytes()).decode()
-    except UsageError as error:
+    except (UsageError, TrainingError) as error:  # no reason to write no report
         return Film(f"{what}: no film: {error}")
     step = policy.about.get("step", 0)
     caption = (
