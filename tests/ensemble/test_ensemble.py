@@ -116,7 +116,7 @@ def test_selection_copies_the_winner_whole(runs: Path) -> None:
 def test_copies_share_no_buffer_and_no_noise(runs: Path, rng: np.random.Generator) -> None:
     """An update of one leaves the other, and for one observation the two act differently."""
     trainer = start(runs)
-    loop, statistics = trainer.loop, trainer.loop.normalizer.statistics()
+    loop, statistics = trainer.loop, trainer.loop.experience.normalizer.statistics()
     observation, actions = np.ones(3, np.float32), []
     with until(trainer, "select"):
         states = jax.device_get(loop.learners.states)
@@ -322,7 +322,10 @@ def test_a_rule_scales_learning_rates(runs: Path, monkeypatch: pytest.MonkeyPatc
     loop = trainer.loop
     scales = [member.scales for member in loop.progress.members]
     assert scales == [{RATE: 0.5}, {RATE: 0.25}]  # the winner, member 1, had half of it already
-    rows, still = loop.replays[0].padded(32).reshape(2, 16, -1), loop.normalizer.statistics()
+    rows, still = (
+        loop.replays[0].padded(32).reshape(2, 16, -1),
+        loop.experience.normalizer.statistics(),
+    )
     hyper = loop.config.hyper
     for k, scale in enumerate((0.5, 0.25)):
         before = jax.tree.map(jnp.copy, loop.learners.states[k])
@@ -589,7 +592,7 @@ def test_clones_on_one_minibatch_part_by_their_keys(
     trainer = start(runs, same_init=True, target_noise=noise)
     loop = trainer.loop
     rows = rng.normal(size=(2, 16, loop.learners.compiled.layout.width)).astype(np.float32)
-    update, statistics = loop.learners.compiled.update, loop.normalizer.statistics()
+    update, statistics = loop.learners.compiled.update, loop.experience.normalizer.statistics()
     moved = [update(loop.learners.states[k], k, 0, rows, None, statistics).state for k in (0, 1)]
     moved = jax.device_get(moved)
     trainer.close()

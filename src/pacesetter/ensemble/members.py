@@ -8,28 +8,25 @@ when the round is over, all start again from what the rule chose        end_roun
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pacesetter import algorithms
 from pacesetter.batch import Spec
 from pacesetter.config import Config
 from pacesetter.ensemble.averages import Averages
 from pacesetter.ensemble.copying import copy_from_parents
+from pacesetter.ensemble.experience import Experience
 from pacesetter.ensemble.explorer import Explorer
 from pacesetter.ensemble.loop import Part, numbered
 from pacesetter.ensemble.policy_checkpoint import PolicyCheckpoints
 from pacesetter.ensemble.progress import Progress
 from pacesetter.ensemble.selection import Selection, Selector
+from pacesetter.ensemble.updates import Updates
 from pacesetter.ensemble.varied import spread
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
 from pacesetter.learner.compiled import of_transitions
 from pacesetter.learner.learners import Learners
-from pacesetter.learner.normalizer import Normalizer, ReturnScale
-from pacesetter.learner.schedule import factors
 from pacesetter.policy import Policy
-from pacesetter.replay.buffer import Replay, Sample, open_replays
-from pacesetter.replay.n_step import NStepQueue
+from pacesetter.replay.buffer import Replay
 
 MAX_CALLS_PER_TICK = 500  # of updates per member, so that a run can stop and save between them
 
@@ -41,31 +38,31 @@ class Members:
         run, hyper, first = config.run, config.hyper, envs[0]
         spec = Spec(first.observation_size, first.action_size)
         compiled = of_transitions(algorithms.find(run.algorithm).build(spec, hyper), run.seed)
-        learner = compiled.learner
         self.config = config
-        self.updates_per_call = learner.updates_per_call
         self.budget = config.budget
-        self.normalizer = Normalizer(spec.observation_size, hyper.normalize_observation)
         self.learners = Learners(compiled, run.members, run.seed, run.same_init)
         # Env n of member k has the number n K + k.
         self.explorers = [
-            Explorer(learner, env, self.learners.policy_params[i % run.members], run.seed, i)
+            Explorer(
+                compiled.learner, env, self.learners.policy_params[i % run.members], run.seed, i
+            )
             for i, env in enumerate(envs)
         ]
-        self.queues = [NStepQueue(hyper.n_step) for _ in envs]
-        self.replays: list[Replay] = []
-        self.returns = ReturnScale(hyper.gamma, len(envs)) if hyper.scales_rewards else None
+        self.experience = Experience(config, spec, compiled.layout, len(envs))
         self.selector = Selector(config, self.budget, first.recipe)
         self.policy_checkpoints = PolicyCheckpoints(hyper, run.members, self.current_policy(0))
         self.averages = Averages(run, self.learners, self.current_policy(0))
         self.progress = Progress.of(run.members, spread(run, hyper, run.seed))
+        self.updates = Updates(config, self.learners, self.experience, self.progress, self.averages)
         self.whole = True
 
+    @property
+    def replays(self) -> list[Replay]:
+        return self.experience.replays
+
     def open_replays(self, folder: Path) -> None:
-        """Make or find the rings."""
-        run, layout = self.config.run, self.learners.compiled.layout
-        count = 1 if run.replay_scope == "shared" else run.members
-        self.replays = open_replays(folder, count, layout, self.config.hyper, self.budget)
+        """Make or find the replays' files."""
+        self.experience.open_replays(folder)
 
     def tick(self) -> Selection | None:
         """One tick; the selection, if it made one."""
@@ -80,7 +77,7 @@ class Members:
     def close(self) -> None:
         """Let go of envs, files and threads."""
         self.learners.workers.shutdown()
-        for each in (*(explorer.env for explorer in self.explorers), self.selector, *self.replays):
+        for each in (*(e.env for e in self.explorers), self.selector, self.experience):
             each.close()
 
     def training_values(self) -> dict[str, Any]:
@@ -103,12 +100,8 @@ class Members:
 
     def current_policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
-        env, statistics = self.explorers[member].env, self.normalizer.statistics()
-        return self.learners.policy(member, env, statistics)
-
-    def replay(self, k: int) -> Replay:
-        """The replay of a member: the shared one, or its own."""
-        return self.replays[k % len(self.replays)]
+        statistics = self.experience.normalizer.statistics()
+        return self.learners.policy(member, self.explorers[member].env, statistics)
 
     # Collect: i is the number of an env, k that of its member.
 
@@ -137,9 +130,7 @@ class Members:
 
     def _start_episode(self, i: int) -> None:
         k = i % self.config.run.members
-        for transition in self.queues[i].flush():  # those of an episode that was abandoned
-            self.replay(k).add(transition, i)
-        self.replay(k).sampler.end(i, None)
+        self.experience.start_episode(i)
         with blame(k, self.progress.step):
             self.explorers[i].start(self.learners.policy_params[k], self.progress.step)
         self.policy_checkpoints.start_episode(k)
@@ -147,23 +138,19 @@ class Members:
     def _step(self, i: int) -> None:
         hyper, progress, explorer = self.config.hyper, self.progress, self.explorers[i]
         k = i % self.config.run.members
-        member = progress.members[k]
+        member, warming_up = progress.members[k], progress.step < hyper.warmup
         if explorer.pending is not None:
             action = explorer.pending
-        elif progress.step < hyper.warmup:
+        elif warming_up:
             action = explorer.random_action()
         else:
-            seen = self.normalizer.scale(explorer.env.observation)
+            seen = self.experience.normalizer.scale(explorer.env.observation)
             action = explorer.act(self.learners.policy_params[k], seen, member.scales)
             member.actions += 1
         transition = explorer.step(action, hyper.gamma, clipped=True)
-        for complete in self.queues[i].push(transition):
-            self.replay(k).add(complete, i)
-        self.normalizer.add(transition.observation)
-        if self.returns:
-            self.returns.add(i, transition.reward, transition.last)
+        self.experience.add(i, transition)
         member.steps += 1
-        if progress.step > hyper.warmup or hyper.warmup_updates:
+        if hyper.warmup_updates or not warming_up:
             member.updates_due += hyper.updates_per_step
         if transition.last:
             self._end_episode(i, k)
@@ -172,10 +159,10 @@ class Members:
         progress, explorer = self.progress, self.explorers[i]
         member, total = progress.members[k], explorer.env.earned
         progress.end_episode(k, total, len(explorer.env.actions))
-        self.replay(k).sampler.end(i, total)
+        self.experience.end_episode(i, total)
         self.selector.end_episode(k, total, explorer.started, member.copied)
         if self.config.hyper.assess and explorer.started >= self.config.hyper.warmup:
-            updates = member.update_calls * self.updates_per_call
+            updates = member.update_calls * self.updates.per_call
             policy = self.current_policy(k)
             self.policy_checkpoints.end_episode(k, total, updates, policy, progress.step)
 
@@ -192,11 +179,11 @@ class Members:
             members = [k for k in range(self.config.run.members) if self._updates_due(k)]
             if not members:
                 break
-            self._update(members)
+            self.updates.make(members)
 
     def _updates_due(self, k: int) -> bool:
         hyper, member = self.config.hyper, self.progress.members[k]
-        if member.updates_due < self.updates_per_call or not len(self.replay(k)):
+        if member.updates_due < self.updates.per_call or not len(self.experience.replay(k)):
             return False
         if member.steps % hyper.block >= hyper.num_envs:  # no block was filled by the last tick
             return False
@@ -204,30 +191,6 @@ class Members:
         if hyper.update_at == "episode" and all(explorer.active for explorer in own):
             return False
         return self.policy_checkpoints.may_update(k)
-
-    def _update(self, members: list[int]) -> None:
-        """One call of the update of each of these members, all at the same time."""
-        statistics, samples = self.normalizer.statistics(), [self._sample(k) for k in members]
-        extra = {"return_deviation": self.returns.deviation} if self.returns else None
-        inputs: list[Any] = []
-        for k, sample in zip(members, samples, strict=True):
-            member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
-            made = member.update_calls * self.updates_per_call
-            scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
-            inputs.append((member.update_calls, *data, extra, scales))
-        results = self.learners.update(members, inputs)
-        for k, sample, result in zip(members, samples, results, strict=True):
-            self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
-            self.replay(k).feedback(sample.numbers, np.asarray(result.td_error))
-            self.progress.members[k].update_calls += 1
-            self.averages.follow(k)
-
-    def _sample(self, k: int) -> Sample:
-        hyper, progress = self.config.hyper, self.progress
-        progress.begin_updates(k, self.updates_per_call, hyper.batch_size)
-        done = self.config.annealed(progress.step)
-        shape = (self.updates_per_call, hyper.batch_size)
-        return self.replay(k).sample(self.learners.sample_streams[k], shape, done)
 
     # End a round.
 
@@ -267,13 +230,10 @@ class Members:
         """What a checkpoint holds; envs come last, because they step when they are restored."""
         return {
             "states": self.learners,
-            "normalizer": self.normalizer,
             "progress": self.progress,
             "selector": self.selector,
             "kept": self.policy_checkpoints,
             "averages": self.averages,
-            **({"returns": self.returns} if self.returns else {}),
-            **numbered("queue", self.queues),
-            **numbered("replay", self.replays),
+            **self.experience.parts(),
             **numbered("env", self.explorers),
         }

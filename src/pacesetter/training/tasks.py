@@ -20,10 +20,13 @@ class Tasks(NamedTuple):
     notes: list[str]
 
 
-def make_tasks(config: Config, before: Apart | None, factory: Factory | None) -> Tasks:
-    """The envs of a new run, or of one that kept its episodes apart in a way `before`."""
+def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) -> Tasks:
+    """The envs of a new run, or of one that kept its episodes apart in a way `before`.
+
+    `env` is what a person gave: an id, which may lack its version, or a function that makes envs.
+    """
     run, hyper = config
-    recipe = replace(config.recipe, factory=factory)
+    recipe = replace(config.recipe, factory=env if callable(env) else None)
     how = before or apart.choose(recipe, run.renew_env)
     recipe = replace(recipe, renew=how is Apart.BY_RENEWAL)
     on_policy = isinstance(hyper, OnPolicy)
@@ -31,4 +34,6 @@ def make_tasks(config: Config, before: Apart | None, factory: Factory | None) ->
     envs = [Environment(recipe, run.seed, Stream.TRAIN, index) for index in range(count)]
     cast = envs[0].check()
     notes = [] if before else cast
+    if isinstance(env, str) and env != run.env:
+        notes.insert(0, f"env: '{env}' has no version; taking the newest, {run.env}")
     return Tasks(envs, recipe, how, notes + apart.notes(how, run.env, resumed=before is not None))

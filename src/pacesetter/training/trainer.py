@@ -90,8 +90,6 @@ class Trainer:
             self.directory.remove()
             raise
         self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
-        if (full := self.config.run.env) != env and isinstance(env, str):
-            self.notes.insert(0, f"env: '{env}' has no version; taking the newest, {full}")
 
     @classmethod
     def resume(
@@ -141,7 +139,7 @@ class Trainer:
 
     def _begin(self, before: Apart | None, env: str | Factory | None) -> None:
         """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
-        tasks = make_tasks(self.config, before, env if callable(env) else None)
+        tasks = make_tasks(self.config, before, env)
         self.apart = tasks.apart
         self._made_with = {"apart": self.apart, **made_with(products.of(self.config.hyper))}
         self.notes += tasks.notes

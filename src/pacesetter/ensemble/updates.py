@@ -1,0 +1,55 @@
+"""The updates of the members, each on minibatches of its own."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pacesetter.config import Config
+from pacesetter.ensemble.averages import Averages
+from pacesetter.ensemble.experience import Experience
+from pacesetter.ensemble.progress import Progress
+from pacesetter.learner.learners import Learners
+from pacesetter.learner.schedule import factors
+from pacesetter.replay.buffer import Sample
+
+
+class Updates:
+    """Samples minibatches, updates the learners on them and tells the replay the TD errors."""
+
+    def __init__(
+        self,
+        config: Config,
+        learners: Learners,
+        experience: Experience,
+        progress: Progress,
+        averages: Averages,
+    ) -> None:
+        self.config, self.learners, self.experience = config, learners, experience
+        self.progress, self.averages = progress, averages
+        self.per_call = learners.compiled.learner.updates_per_call
+
+    def make(self, members: Sequence[int]) -> None:
+        """One call of the update of each of these members, all at the same time."""
+        samples = [self._sample(k) for k in members]
+        statistics, returns = self.experience.normalizer.statistics(), self.experience.returns
+        extra = {"return_deviation": returns.deviation} if returns else None
+        inputs: list[Any] = []
+        for k, sample in zip(members, samples, strict=True):
+            member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
+            made = member.update_calls * self.per_call
+            scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
+            inputs.append((member.update_calls, *data, extra, scales))
+        results = self.learners.update(members, inputs)
+        for k, sample, result in zip(members, samples, results, strict=True):
+            self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
+            self.experience.replay(k).feedback(sample.numbers, np.asarray(result.td_error))
+            self.progress.members[k].update_calls += 1
+            self.averages.follow(k)
+
+    def _sample(self, k: int) -> Sample:
+        batch_size, progress = self.config.hyper.batch_size, self.progress
+        progress.begin_updates(k, self.per_call, batch_size)
+        done = self.config.annealed(progress.step)
+        shape = (self.per_call, batch_size)
+        return self.experience.replay(k).sample(self.learners.sample_streams[k], shape, done)
