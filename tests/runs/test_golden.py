@@ -10,7 +10,7 @@ from pacesetter import policy, storage
 from pacesetter.cli.main import main
 from pacesetter.ensemble.progress import Progress
 from pacesetter.runs import SCHEMA, RunDirectory
-from pacesetter.training import checkpoint
+from pacesetter.training import identity
 
 DATA = Path(__file__).parents[1] / "data"
 # A run of 260 steps of multi-td3 on Pendulum-v1, without its replay: folder and two fresh returns.
@@ -29,7 +29,7 @@ def golden(request: pytest.FixtureRequest, tmp_path: Path) -> RunDirectory:
 
 def test_today_has_a_golden_run() -> None:
     """A new schema needs a folder of its own; those of old ones stay."""
-    assert f"run-{SCHEMA}-checkpoint-{checkpoint.SCHEMA}" in GOLDEN
+    assert f"run-{SCHEMA}-checkpoint-{identity.SCHEMA}" in GOLDEN
     assert {path.name for path in DATA.glob("run-*")} == GOLDEN.keys()
     assert sum(path.stat().st_size for path in DATA.rglob("*") if path.is_file()) < 100_000
 
@@ -45,7 +45,7 @@ def test_a_golden_run_is_read(golden: RunDirectory, capsys: pytest.CaptureFixtur
     assert [row["step"] for row in golden.rows("eval")] == [0, 100, 200, 260]
     table = storage.read(golden.state_file, "checkpoint").table
     assert Progress.load(table["progress"]).step == 260
-    assert checkpoint._identity(golden.config()) == table["run"]
+    assert identity.identity(golden.config()) == table["run"]
 
 
 @pytest.mark.parametrize("file", ["policy_file", "best_file"])

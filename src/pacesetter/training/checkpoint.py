@@ -1,9 +1,7 @@
 """A whole run to a file and back, bit for bit; each part of the loop saves and restores itself."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,15 +14,18 @@ from pacesetter.learner.tree_arrays import below
 from pacesetter.process import threads
 from pacesetter.replay.buffer import Replay
 from pacesetter.runs import RunDirectory
-from pacesetter.settings import Settings
 from pacesetter.settings.validation import Natural, check
 from pacesetter.storage import Content
+from pacesetter.training.identity import (
+    KIND,
+    SCHEMA,
+    Refused,
+    fixed,
+    identity,
+    refuse_strangers,
+)
 from pacesetter.types import Arrays
 
-KIND = "checkpoint"
-SCHEMA = 4
-# What a run is given anew by flags of `resume`, or what changes no result of it.
-FREE_ON_RESUME = {"steps", "time", "stop_at", "name", "env_timeout", "checkpoint_every", "device"}
 LATER = ("averages",)  # parts that the first checkpoints of this schema have not
 
 
@@ -36,10 +37,6 @@ class _Header:
     threads: Natural
     products: str = "xla"
     log_hash: str | None = None  # old ones have none
-
-
-class _Refused(UsageError):  # noqa: N818
-    """What the checkpoint before would not cure."""
 
 
 def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
@@ -55,34 +52,13 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
         "schema": SCHEMA,
         "threads": threads(),
         "products": products.of(config.hyper),
-        "run": _identity(config),
+        "run": identity(config),
         **{name: part.table() for name, part in loop.parts().items()},
-        "settings": _fixed(config),
+        "settings": fixed(config),
         "log": size,
         "log_hash": log_hash,
     }
     storage.write(directory.state_file, KIND, Content(arrays, table), directory.previous_file)
-
-
-def refuse_other_settings(config: Config, directory: RunDirectory) -> None:
-    """Refuse to go on with settings that the newest checkpoint was not made with.
-
-    Old checkpoints do not tell; a setting that is newer than the checkpoint is no difference.
-    """
-    for file in (directory.state_file, directory.previous_file):
-        try:
-            made_with: dict[str, Any] = storage.read(file, KIND).table.get("settings", {})
-        except UsageError:  # which `restore` will tell
-            continue
-        now = _fixed(config)
-        found = [key for key in now if key in made_with and now[key] != made_with[key]]
-        if found:
-            differences = ", ".join(f"{key}={now[key]}, not {made_with[key]}" for key in found)
-            raise UsageError(
-                f"{directory.config_file}: has {differences} as in its checkpoint; put that back, "
-                "or train under another --name"
-            )
-        return
 
 
 def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
@@ -92,7 +68,7 @@ def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
     for file in (file for file in files if storage.present(file)):
         try:
             _restore(loop, config, directory, file, notes)
-        except _Refused:
+        except Refused:
             raise
         except UsageError as error:
             notes.append(f"{error}; trying the checkpoint before it")
@@ -113,7 +89,7 @@ def _restore(
     loop: Loop, config: Config, directory: RunDirectory, file: Path, notes: list[str]
 ) -> None:
     arrays, table = storage.read(file, KIND)
-    _refuse_strangers(file, table, config)
+    refuse_strangers(file, table, config)
     try:
         check(_Header, table)
         size: int = table["log"]
@@ -141,38 +117,11 @@ def _restore(
         )
 
 
-def _refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None:
-    schema = table.get("schema")
-    if schema == 3:
-        raise _Refused(
-            f"{file}: checkpoint schema 3 was made by an earlier pacesetter 0.1, this version "
-            f"reads {SCHEMA}; resume the run with the commit that its config.json names, or train "
-            "it again under another --name"
-        )
-    if schema != SCHEMA:
-        raise UsageError(f"{file}: checkpoint schema {schema}, this version reads {SCHEMA}")
-    if table.get("run") != _identity(config):
-        raise UsageError(f"{file}: is of another run: {table.get('run')}")
-
-
 def _refuse_other_log(directory: RunDirectory, size: int, log_hash: str | None) -> None:
     try:
         directory.log.refuse_other(size, log_hash)
     except UsageError as error:
-        raise _Refused(str(error)) from None
-
-
-def _identity(config: Config) -> dict[str, Any]:
-    names = ("algorithm", "env", "env_kwargs", "seed", "members")
-    wrap = {"wrap": [*config.run.wrap]} if config.run.wrap else {}  # which older ones do not name
-    return {name: getattr(config.run, name) for name in names} | wrap
-
-
-def _fixed(config: Config) -> Settings:
-    """The settings that a run keeps, as JSON gives them back."""
-    return json.loads(
-        json.dumps({k: v for k, v in config.settings().items() if k not in FREE_ON_RESUME})
-    )
+        raise Refused(str(error)) from None
 
 
 def _refuse_faults(arrays: Arrays, step: int) -> None:

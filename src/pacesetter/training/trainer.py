@@ -21,7 +21,7 @@ from pacesetter.runs import RunDirectory, find
 from pacesetter.settings import OnPolicy
 from pacesetter.settings.budget import is_reached, out_of_time
 from pacesetter.settings.files import read_file
-from pacesetter.training import checkpoint
+from pacesetter.training import checkpoint, identity
 from pacesetter.training.evaluator import Evaluator
 from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
@@ -115,7 +115,7 @@ class Trainer:
         if changed := {key: value for key, value in budgets.items() if value is not None}:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
-        checkpoint.refuse_other_settings(self.config, self.directory)
+        identity.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
         self._begin(apart.recorded(self.directory.record()), env)
         self.directory.lock()
