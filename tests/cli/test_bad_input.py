@@ -235,7 +235,7 @@ BAD_TASKS = {
     "NanObservation": ["observation", "finite", "number 1", "nan"],
     "NanReset": ["observation", "finite", "nan"],
     "TextObservation": ["observation", "numbers"],
-    "HugeReward": ["reward", "finite in float32", "1e+39"],
+    "HugeReward": ["reward", "finite and at most", "1e+39"],
     "InfiniteReward": ["reward", "finite", "inf"],
     "ArrayReward": ["reward", "one number"],
     "NoReward": ["reward", "one number", "None"],

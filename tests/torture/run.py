@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
 import configurations  # noqa: E402
+import faults  # noqa: E402
 import odd_files  # noqa: E402
 import page  # noqa: E402
 import processes  # noqa: E402
@@ -78,6 +79,15 @@ EXPERIMENTS = (
         processes.signals,
         12,
         200,
+        Tally.of_processes,
+    ),
+    Experiment(
+        "faults",
+        "NaN, infinity or 1e38 as observation, reward, action, loss, weight or moment",
+        "found within 100 calls of an update, named by place, member and step; in no file",
+        faults.run,
+        18,
+        162,
         Tally.of_processes,
     ),
 )

@@ -4,6 +4,7 @@ from datetime import date
 from pathlib import Path
 
 import configurations
+import faults
 import odd_files
 import page
 import processes
@@ -40,6 +41,11 @@ def test_files_that_are_no_longer_what_they_were(tmp_path: Path) -> None:
 
 def test_a_signal_at_any_moment(tmp_path: Path) -> None:
     assert processes.signals(tmp_path, 1, seed=5).wrong == []
+
+
+def test_a_number_that_is_none(tmp_path: Path) -> None:
+    tally = faults.run(tmp_path, 4, seed=5)
+    assert (tally.made, tally.wrong) == (4, [])
 
 
 def test_an_attempt_sees_what_goes_wrong(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pacesetter.envs import Environment, Snapshot
 from pacesetter.errors import TrainingError
 from pacesetter.learner.scales import scaled
 from pacesetter.learner.tree_arrays import flatten, rebuild
+from pacesetter.limits import ALLOWED, LARGEST
 from pacesetter.networks.forward import clip
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings.validation import Finite, Natural, check
@@ -67,8 +68,8 @@ class Explorer:
 
     def step(self, action: Floats, gamma: float, clipped: bool) -> Transition:
         """Step the env with the clipped action; the transition holds it clipped or as it is."""
-        if not np.isfinite(action).all():
-            raise TrainingError(f"action is not finite: {action}")
+        if not np.logical_and.reduce(np.abs(action) <= LARGEST, axis=None):
+            raise TrainingError(f"action: must be {ALLOWED}, is {action}")
         env, sent, self.pending = self.env, clip(action), action
         before, earned = env.observation, env.earned
         step = env.step(sent)

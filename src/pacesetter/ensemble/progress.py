@@ -3,7 +3,6 @@
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from math import isfinite
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -11,6 +10,7 @@ from pydantic import Field
 from pacesetter.ensemble.rules import Choice
 from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
+from pacesetter.limits import DIVERGED
 from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import Arrays, Floats
 
@@ -113,9 +113,9 @@ class Progress:
         self.transitions += updates * batch_size
 
     def add_losses(self, names: Sequence[str], losses: Floats, who: str = "") -> None:
-        """Add the losses of one update to what the next row averages, if all are finite."""
+        """Add the losses of one update to what the next row averages, if none has diverged."""
         for name, loss in zip(names, losses.tolist(), strict=True):
-            if not isfinite(loss):
+            if not abs(loss) <= DIVERGED:
                 raise TrainingError(f"{who}step {self.step}: {name} is {loss}")
             self.losses[name] = self.losses.get(name, 0.0) + loss
         self.summed += 1

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pacesetter.errors import show
+from pacesetter.limits import ALLOWED, LARGEST
 from pacesetter.types import Floats, Shape
 
-LARGEST = np.finfo(np.float32).max  # the replay keeps all numbers in float32
-MAX_REWARD = float(LARGEST)
 ROUNDING = 1e-6  # of a bound; float32 has seven digits
 
 
@@ -45,29 +44,29 @@ def step(given: Any, shape: Shape) -> Step:
 
 
 def observation(given: Any, shape: Shape) -> Floats:
-    """Flat float32 numbers of an observation of a shape; all must be finite."""
+    """Flat float32 numbers of an observation of a shape, none too large to learn from."""
     try:
         raw = np.asarray(given)
         if raw.dtype.kind not in "bfiuO":
             raise TypeError
         inside = np.abs(raw) <= LARGEST
-        finite = np.logical_and.reduce(inside, axis=None)  # `all` without a call of Python
-        flat = np.array(raw if finite else 0, np.float32).ravel()
+        fine = np.logical_and.reduce(inside, axis=None)  # `all` without a call of Python
+        flat = np.array(raw if fine else 0, np.float32).ravel()
     except Exception:
         raise ValueError(f"observation: must be numbers, got {show(given)}") from None
     if raw.shape != shape and not raw.size == np.prod(shape) == 1:
         raise ValueError(f"observation: must have shape {shape} as its space, has {raw.shape}")
-    if not finite:
+    if not fine:
         n = int(np.flatnonzero(~inside)[0])
-        raise ValueError(f"observation: must be finite, number {n} is {raw.ravel()[n]}")
+        raise ValueError(f"observation: must be {ALLOWED}, number {n} is {raw.ravel()[n]}")
     return flat
 
 
 def reward(given: Any) -> float:
-    """One finite number, which may come as an array of one."""
+    """One number that is not too large to learn from, which may come as an array of one."""
     number = given if isinstance(given, (int, float, np.floating)) else _single("reward", given)
-    if not abs(number) <= MAX_REWARD:
-        raise ValueError(f"reward: must be finite in float32, got {show(given)}")
+    if not abs(number) <= LARGEST:
+        raise ValueError(f"reward: must be {ALLOWED}, got {show(given)}")
     return float(number)
 
 

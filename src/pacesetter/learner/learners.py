@@ -1,6 +1,6 @@
 """The states of K learners of one compiled program, and their updates at the same time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -10,9 +10,11 @@ import numpy as np
 
 from pacesetter.algorithms.contract import State
 from pacesetter.envs import Environment
+from pacesetter.errors import TrainingError
 from pacesetter.learner.compiled import CompiledLearner, MemberUpdate
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.tree_arrays import flatten, rebuild
+from pacesetter.limits import DIVERGED, worst
 from pacesetter.policy import Policy
 from pacesetter.process import threads
 from pacesetter.seeding import Stream, generator
@@ -53,6 +55,13 @@ class Learners:
             self.states[k] = result.state
             self.policy_params[k] = jax.tree.map(np.asarray, result.policy_params)
         return results
+
+    def refuse_faults(self, members: Iterable[int], step: int) -> None:
+        """Stop a run whose weights or moments are not finite, or soon will not be."""
+        for k in members:
+            for name, array in flatten(self.states[k]).items():
+                if (found := worst(array, DIVERGED)) is not None:
+                    raise TrainingError(f"member {k}, step {step}: {name} holds {found}")
 
     def policy(self, member: int, env: Environment, statistics: Statistics) -> Policy:
         """A member's policy as it is now, for an env like this one."""

@@ -10,6 +10,7 @@ from pacesetter.config import Config
 from pacesetter.ensemble.loop import Loop
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.learner import products
+from pacesetter.learner.learners import Learners
 from pacesetter.learner.tree_arrays import below
 from pacesetter.process import threads
 from pacesetter.replay.buffer import Replay
@@ -42,9 +43,11 @@ class _Header:
 def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
     """Write the checkpoint; the one before it stays as previous.safetensors."""
     arrays: Arrays = {}
+    loop.learners.refuse_faults(range(config.run.members), loop.progress.step)
     for name, part in loop.parts().items():
         found = {f"{name}.{key}": array for key, array in part.arrays().items()}
-        if not isinstance(part, Replay):  # whose scores are NaN until an episode ends
+        # Scores of a replay are NaN until an episode ends; learners are checked above.
+        if not isinstance(part, (Replay, Learners)):
             _refuse_faults(found, loop.progress.step)
         arrays |= found
     size, log_hash = directory.log.seal()
@@ -125,9 +128,7 @@ def _refuse_other_log(directory: RunDirectory, size: int, log_hash: str | None) 
 
 
 def _refuse_faults(arrays: Arrays, step: int) -> None:
-    """Stop a run whose arrays are not all finite; states are named with their member."""
+    """Stop a run whose arrays are not all finite."""
     for name, array in arrays.items():
         if not np.isfinite(array).all():
-            part, member, *_ = [*name.split("."), ""]
-            where = f"member {member}, " if part == "states" else ""
-            raise TrainingError(f"{where}step {step}: {name} is not finite")
+            raise TrainingError(f"step {step}: {name} is not finite")

@@ -45,6 +45,7 @@ class Evaluator:
         Nothing changes before all is played. Raises Stopped after `stop`.
         """
         run, progress = self.config.run, self.loop.progress
+        self.loop.learners.refuse_faults(range(run.members), progress.step)
         policy = self.policy()
         trial = self._trial(policy.act, progress.champion)
         values = trial.table() | {"champion": progress.champion}

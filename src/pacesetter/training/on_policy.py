@@ -126,7 +126,8 @@ class OnPolicyLoop:
         data, extra = self.source.data(rows, progress.updates)
         inputs = (progress.updates, data, None, self.normalizer.statistics(), extra)
         (result,) = self.learners.update([0], [inputs])
-        progress.add_losses(self.learners.loss_names, result.losses)
+        progress.add_losses(self.learners.loss_names, result.losses, "member 0, ")
+        self.learners.refuse_faults([0], progress.step)
         progress.updates += 1
         progress.transitions += int(extra.get("valid", len(rows)))
         for observation in self.layout.unpack(rows).observation:
