@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 from broken_envs import Late
-from short_runs import TINY, assert_same, run_to_end
+from short_runs import TINY, assert_same, run_to_end, run_to_step
 from stopping import (
     PATIENCE,
     RING,
@@ -274,6 +274,23 @@ def test_task_that_hangs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         "it has not returned after 1 s, the limit of --env-timeout\n"
     )
     assert saved_step(only_run(tmp_path)) == 148
+
+
+def test_run_that_gets_a_limit_when_it_is_resumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that hangs and was killed goes on with `--env-timeout`, which config.json keeps."""
+    settings: dict[str, Any] = {**TINY, "steps": 500, "renew_env": False, "runs": tmp_path}
+    settings["env_kwargs"] = {"mark": str(tmp_path / "mark")}
+    directory = run_to_step(Trainer("td3", "broken_envs:Hangs-v0", **settings), 50)
+    again = ["resume", str(directory.path), "-q", "--allow=broken_envs:Hangs-v0"]
+    assert main([*again, "--env-timeout", "soon"]) == 2
+    assert "env_timeout" in capsys.readouterr().err
+    assert main([*again, "--env-timeout", "1s", "--checkpoint-every", "5m"]) == 1
+    assert "the limit of --env-timeout" in capsys.readouterr().err
+    assert directory.settings()["env_timeout"] == 1
+    assert directory.settings()["checkpoint_every"] == 300
+    assert saved_step(directory) == 148  # a step of its life was the test at the start
 
 
 def test_fault_in_an_evaluation(tmp_path: Path, disarmed: None) -> None:

@@ -84,10 +84,13 @@ def _resumed_trainer(words: list[str]) -> Command:
 
     command = parser("resume", "Continue a run from its last checkpoint, exactly as it would have.")
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
-    command.add_argument("--steps", metavar="N", help="new budget of env steps, such as 2M")
-    command.add_argument("--time", metavar="T", help="new limit of wall time, such as 2h")
-    goal = "new mean return to stop at"
-    command.add_argument("--stop-at", type=float, metavar="RETURN", help=goal)
+    add = command.add_argument
+    add("--steps", metavar="N", help="new budget of env steps, such as 2M")
+    add("--time", metavar="T", help="new limit of wall time, such as 2h")
+    add("--stop-at", type=float, metavar="RETURN", help="new mean return to stop at")
+    limit = "new longest time of a task's step or reset, such as 30s"
+    add("--env-timeout", metavar="T", help=limit)
+    add("--checkpoint-every", metavar="T", help="new time between checkpoints, such as 5m")
     command.add_allow()
     command.add_runs()
     command.add_log()
@@ -98,9 +101,10 @@ def _resumed_trainer(words: list[str]) -> Command:
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    given = {"steps": found.steps, "time": found.time, "stop_at": found.stop_at}
+    names = ("steps", "time", "stop_at", "env_timeout", "checkpoint_every", "allow")
+    given = {name: getattr(found, name) for name in names}
     with aside():
-        trainer = Trainer.resume(directory.path, allow=found.allow, **given)
+        trainer = Trainer.resume(directory.path, **given)
     return Command(trainer, found.quiet, log)
 
 

@@ -100,10 +100,12 @@ class Trainer:
         steps: int | str | None = None,
         time: float | str | None = None,
         stop_at: float | None = None,
+        env_timeout: float | str | None = None,
+        checkpoint_every: float | str | None = None,
         allow: Iterable[str] = (),
         env: Factory | None = None,
     ) -> Self:
-        """Take up a run where its last checkpoint left it, with a new budget if one is given.
+        """Take up a run where its last checkpoint left it, with a new budget or times if given.
 
         `allow` are names in its config that may import a module; `env` is the function that made
         its envs, if one did.
@@ -111,8 +113,9 @@ class Trainer:
         self = cls.__new__(cls)
         self.directory = find(str(run), runs)
         self.config = self.directory.config(allow)
-        budgets = {"steps": steps, "time": time, "stop_at": stop_at}
-        if changed := {key: value for key, value in budgets.items() if value is not None}:
+        given = {"steps": steps, "time": time, "stop_at": stop_at}
+        given |= {"env_timeout": env_timeout, "checkpoint_every": checkpoint_every}
+        if changed := {key: value for key, value in given.items() if value is not None}:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
         identity.refuse_other_settings(self.config, self.directory)
