@@ -54,6 +54,12 @@ class Task:
     stop_at: float | None = Field(
         None, description="stop at the first evaluation whose mean return is this; default never"
     )
+    stop_patience: int | None = Field(
+        None,
+        ge=1,
+        description="stop after so many evaluations in a row, from the first update on, without "
+        "a new best mean return; default never",
+    )
     start_from: str | None = Field(
         None,
         min_length=1,

@@ -217,24 +217,6 @@ def test_presets() -> None:
 # Bins.
 
 
-def test_critics_with_bins_learn_from_scaled_rewards(rng: np.random.Generator) -> None:
-    """Rewards over their returns' deviation: ten times both changes nothing, one alone does."""
-    algorithm = learner(bins=11)
-    state = algorithm.init(jax.random.key(0))
-    batch = batches(rng, updates=algorithm.updates_per_call)
-    found: list[Any] = []
-    for reward, deviation in ((1.0, 2.0), (10.0, 20.0), (10.0, 2.0)):
-        scaled = batch._replace(
-            reward=batch.reward * reward, return_deviation=jnp.float32(deviation)
-        )
-        after = algorithm.update(state, scaled, jax.random.key(1))
-        assert all(np.isfinite(loss) for loss in after.losses.values())
-        found.append(jax.tree.leaves(after.state.critic))
-    for one, same in zip(*found[:2], strict=True):
-        np.testing.assert_allclose(one, same, rtol=1e-3, atol=1e-5)
-    assert any(not np.allclose(a, b, atol=1e-4) for a, b in zip(found[0], found[2], strict=True))
-
-
 def test_loss_with_bins_is_that_of_the_head(rng: np.random.Generator) -> None:
     """The first update's loss, told from the critics' own outputs in one pass: cross-entropy to
     the target of the lowest critic, summed over critics; each critic has an output per bin.

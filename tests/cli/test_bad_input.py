@@ -142,11 +142,11 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "unknown env, no version": (["train", "td3", "Zzz"], ["env", "'Zzz'", "module:Id-v0"]),
     "env of another package": (
         ["train", "td3", "FetchReach-v4"],
-        ["pip install 'gymnasium-robotics'", "gymnasium_robotics:FetchReach-v4"],
+        ["pip install gymnasium-robotics", "gymnasium_robotics:FetchReach-v4"],
     ),
     "dm_control": (
         ["train", "td3", "dm_control/cheetah-run-v0"],
-        ["shimmy[dm-control]", "shimmy:dm_control/cheetah-run-v0"],
+        ["pip install 'shimmy[dm-control]' 'mujoco<4'", "shimmy:dm_control/cheetah-run-v0"],
     ),
     "versions in a module": (
         ["train", "td3", "odd_envs:OddInfo"],

@@ -44,6 +44,7 @@ CASES = {
         "num_envs": 2,
         "replay": "return",
         "update_every": 5,
+        "normalize_reward": True,
     },
     "parameter": {
         "env": "Hopper-v5",

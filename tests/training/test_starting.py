@@ -11,8 +11,10 @@ from short_runs import TINY, assert_same, log, run_to_end
 from stopping import stop_at
 
 from pacesetter import policy
+from pacesetter.cli.show import state
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
+from pacesetter.settings.budget import Standing, standing
 from pacesetter.study.bench.queue import Job, is_finished
 from pacesetter.study.compare.gathering import gather
 from pacesetter.training.trainer import Trainer
@@ -132,6 +134,35 @@ def test_it_goes_on_with_a_higher_return(runs: Path) -> None:
     run_to_end(more)
     assert more.progress.step == 400
     assert more.directory.config().run.stop_at == 1e9
+
+
+def test_a_run_stops_after_evaluations_without_a_best_one(runs: Path) -> None:
+    settings: dict[str, Any] = {"steps": 2000, "eval_every": 100, "warmup": 300}
+    whole = trained(runs, name="whole", **settings)
+    rows = [row for row in log(whole.directory) if row["kind"] == "eval" and row["step"] > 0]
+    means = [row["mean"] for row in rows]
+    learning = [n for n, row in enumerate(rows) if row["updates"] > 0]
+    bad = [n for n in learning if means[n] <= max(means[:n])]
+    ends = next(n for n in bad if n - 1 in bad)  # the second one in a row
+    assert ends < len(means) - 1
+    short = trained(runs, name="short", stop_patience=2, **settings)
+    assert short.finished
+    assert short.progress.step == (ends + 1) * 100
+    assert [r["mean"] for r in log(short.directory) if r["kind"] == "eval"][1:] == means[: ends + 1]
+    assert is_finished(Job(short.config, short.directory, []))
+    (seen,), *_ = gather([short.directory.path])
+    assert seen.finished
+    assert state(short.directory)["state"] == "finished"
+    more = Trainer.resume(short.directory.path, stop_patience=1000)
+    run_to_end(more)
+    assert [r["mean"] for r in log(more.directory) if r["kind"] == "eval"][1:] == means
+
+
+def test_evaluations_before_the_first_update_cannot_make_progress() -> None:
+    before = [(0, 9.0, 0), (100, 1.0, 0), (200, 1.0, 0), (300, 0.0, 0)]
+    assert standing(before) == Standing(1.0, 0)
+    assert standing([*before, (400, 0.5, 10), (500, 1.0, 20)]) == Standing(1.0, 2)
+    assert standing([*before, (400, 0.5, 10), (500, 1.5, 20)]) == Standing(1.5, 0)
 
 
 # Keep policies of the past.

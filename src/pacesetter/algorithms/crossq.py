@@ -87,7 +87,7 @@ class Hyper(OffPolicy):
 
     @property
     def scales_rewards(self) -> bool:
-        return self.bins > 0
+        return self.normalize_reward or self.bins > 0
 
 
 class State(NamedTuple):
@@ -147,9 +147,6 @@ class CrossQ(StochasticLearner):
         )
 
     def update(self, state: State, batch: Batch, key: Array) -> Update:
-        if self.hyper.scales_rewards:
-            scale = batch.return_deviation
-            batch = batch._replace(reward=batch.reward / scale, return_deviation=None)
         keys = jax.random.split(key, self.updates_per_call + 1)
         state, (critic_loss, td_error) = each_minibatch(self.fit_critic, state, batch, keys[:-1])
         state, losses = self.fit_actor(state, last_minibatch(batch), keys[-1])

@@ -7,7 +7,7 @@ from tabulate import tabulate
 from pacesetter.cli.flags import parser
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
-from pacesetter.settings.budget import budget, is_spent
+from pacesetter.settings.budget import budget, is_spent, standing
 from pacesetter.storage import FAULTS, as_json
 from pacesetter.text import printable
 
@@ -59,8 +59,9 @@ def state(run: RunDirectory) -> Row:
     """How far a run is, and whether it is running, finished or stopped."""
     settings, rows = run.settings(), run.rows()
     last = rows[-1] if rows else {"step": 0, "wall_seconds": 0.0}
-    means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
-    over = is_spent(settings, last["step"], last["wall_seconds"], max(means, default=None))
+    evaluated = [row for row in rows if row["kind"] == "eval"]
+    now = standing((row["step"], row["mean"], row["updates"]) for row in evaluated)
+    over = is_spent(settings, last["step"], last["wall_seconds"], now)
     name = "running" if run.in_use() else "finished" if over else "stopped"
     return {"step": last["step"], "budget": budget(settings), "state": name}
 

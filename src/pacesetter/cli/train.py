@@ -88,6 +88,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     add("--steps", metavar="N", help="new budget of env steps, such as 2M")
     add("--time", metavar="T", help="new limit of wall time, such as 2h")
     add("--stop-at", type=float, metavar="RETURN", help="new mean return to stop at")
+    patience = "new number of evaluations without a best one, after which to stop"
+    add("--stop-patience", type=int, metavar="N", help=patience)
     limit = "new longest time of a task's step or reset, such as 30s"
     add("--env-timeout", metavar="T", help=limit)
     add("--checkpoint-every", metavar="T", help="new time between checkpoints, such as 5m")
@@ -101,7 +103,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     fix_threads(directory.record().get("threads"))
     from pacesetter.training.trainer import Trainer
 
-    names = ("steps", "time", "stop_at", "env_timeout", "checkpoint_every", "allow")
+    budgets = ("steps", "time", "stop_at", "stop_patience")
+    names = (*budgets, "env_timeout", "checkpoint_every", "allow")
     given = {name: getattr(found, name) for name in names}
     with aside():
         trainer = Trainer.resume(directory.path, **given)

@@ -11,6 +11,7 @@ from pacesetter.ensemble.rules import Choice
 from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
 from pacesetter.limits import DIVERGED
+from pacesetter.settings.budget import Standing
 from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import Arrays, Floats
 
@@ -50,6 +51,7 @@ class Progress:
     last_evaluation: int = -1
     next_train: Natural = TRAIN_ROW_EVERY
     best: Finite | None = None
+    since_best: Natural = 0  # evaluations
     ended: list[Ended] = field(default_factory=list[Ended])  # since the last row
     losses: dict[str, Finite] = field(default_factory=dict[str, float])  # sums since the last row
     summed: Natural = 0  # how many losses were summed
@@ -67,6 +69,11 @@ class Progress:
         check(cls, table)
         members: Any = [Member(**member) for member in table["members"]]
         return cls(**(table | {"members": members}))
+
+    @property
+    def standing(self) -> Standing:
+        """How the evaluations stand."""
+        return Standing(self.best, self.since_best)
 
     @property
     def step(self) -> int:

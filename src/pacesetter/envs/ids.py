@@ -1,15 +1,16 @@
 """Ids of tasks: which there are, the newest of a name, and what to write for an unknown one."""
 
 import re
+import shlex
 
 import gymnasium
 
 from pacesetter.errors import UsageError, unknown
 
-# How ids of other packages begin, the module that registers them, and the package for pip.
+# How ids of other packages begin, the module that registers them, and the packages for pip.
 PACKAGES = (
     (r"Fetch|Hand|Adroit|Franka|PointMaze|AntMaze", "gymnasium_robotics", "gymnasium-robotics"),
-    (r"dm_control/", "shimmy", "shimmy[dm-control]"),
+    (r"dm_control/", "shimmy", "shimmy[dm-control] mujoco<4"),
     (r"Meta-World/", "metaworld", "metaworld"),
     (r"Panda", "panda_gym", "panda-gym"),
     (r"(highway|merge|roundabout|parking|racetrack)-", "highway_env", "highway-env"),
@@ -41,11 +42,11 @@ def refuse_unknown(name: str) -> None:
     """Refuse an id that is not registered; one of a package that is known gets its module."""
     if ":" in name or name in known():
         return
-    for pattern, module, package in PACKAGES:
+    for pattern, module, packages in PACKAGES:
         if re.match(pattern, name):
             raise UsageError(
-                f"env: '{name}' is a task of another package; `pip install '{package}'` and write "
-                f"{module}:{name}"
+                f"env: '{name}' is a task of another package; "
+                f"`pip install {shlex.join(packages.split())}` and write {module}:{name}"
             )
     refusal = unknown("env", name, known(), see="pacesetter list envs")
     raise UsageError(f"{refusal}; a task of another package is written module:Id-v0")

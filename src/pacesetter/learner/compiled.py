@@ -110,7 +110,7 @@ class CompiledLearner:
         rows, weight, statistics, extra, *_ = *inputs, None
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
-            batch = self._batch(rows, weight, statistics)._replace(**extra)
+            batch = self._batch(rows, weight, statistics, extra)
             return self.learner.update(state, batch, self.key).losses
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))
@@ -154,7 +154,7 @@ class CompiledLearner:
         scales: dict[str, Array],
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
-        batch = self._batch(rows, weight, statistics)._replace(**extra)
+        batch = self._batch(rows, weight, statistics, extra)
         whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
         learner = scaled(self.learner, scales) if scales else self.learner
         if "gamma" in scales:  # rows hold the discount of the run's own gamma
@@ -166,13 +166,17 @@ class CompiledLearner:
         params = jax.tree.map(jnp.copy, self.learner.policy_params(update.state))
         return update.state, losses, update.td_error, params
 
-    def _batch(self, rows: Any, weight: Any, statistics: Any) -> Any:
+    def _batch(self, rows: Any, weight: Any, statistics: Any, extra: dict[str, Any]) -> Any:
         batch = self.layout.unpack(rows)
-        return batch._replace(
+        batch = batch._replace(
             weight=jnp.ones(rows.shape[:-1]) if weight is None else weight,
             observation=self._scale(batch.observation, statistics),
             next_observation=self._scale(batch.next_observation, statistics),
+            **extra,
         )
+        if batch.return_deviation is None:
+            return batch
+        return batch._replace(reward=batch.reward / batch.return_deviation, return_deviation=None)
 
     def _scale(self, observation: Array, statistics: Any) -> Array:
         if not self.normalize:

@@ -149,14 +149,18 @@ class OffPolicy(Hyper):
     lr_horizon: Annotated[Count | None, AfterValidator(_check_horizon)] = Field(
         None, ge=1, description="env steps until that share is reached; default --steps"
     )
+    normalize_reward: Switch = Field(
+        False,
+        description="divide rewards by the running standard deviation of discounted returns",
+    )
     precision: Literal["f32", "bf16"] = Field(
         "f32", description="precision of large matrix products; accumulation is always float32"
     )
 
     @property
     def scales_rewards(self) -> bool:
-        """Whether the learner divides rewards by the standard deviation of discounted returns."""
-        return False
+        """Whether a batch's rewards are over the standard deviation of discounted returns."""
+        return self.normalize_reward
 
     @property
     def block(self) -> int:

@@ -1,4 +1,7 @@
-"""What a run may spend, read off its flat settings: env steps, time, and a return to stop at."""
+"""What a run may spend, read off its flat settings: env steps, time, and when to stop early."""
+
+from collections.abc import Iterable
+from typing import NamedTuple
 
 from pacesetter.settings import Settings
 
@@ -19,16 +22,35 @@ def out_of_time(settings: Settings, wall_seconds: float) -> bool:
     return limit is not None and wall_seconds >= limit
 
 
-def is_reached(settings: Settings, best: float | None) -> bool:
-    """Whether a run has a return to reach and an evaluation's mean has reached it."""
-    goal = settings.get("stop_at")
-    return goal is not None and best is not None and best >= goal
+class Standing(NamedTuple):
+    """How a run's evaluations stand: the highest mean return, and how many came since."""
+
+    best: float | None = None
+    since: int = 0
+
+    def after(self, mean: float, updates: float) -> "Standing":
+        """With one evaluation more. One before the first update cannot have made progress."""
+        if self.best is None or mean > self.best:
+            return Standing(mean)
+        return Standing(self.best, self.since + (updates > 0))
 
 
-def is_spent(settings: Settings, step: float, wall_seconds: float, best: float | None) -> bool:
-    """Whether a run has made all its env steps, is out of time, or has reached its return.
+def standing(evaluations: Iterable[tuple[float, float, float]]) -> Standing:
+    """How evaluations stand, given as (step, mean return, updates); that of step 0 is not asked."""
+    found = Standing()
+    for step, mean, updates in evaluations:
+        found = found.after(mean, updates) if step > 0 else found
+    return found
 
-    `best` is the highest mean return of its evaluations.
-    """
+
+def is_settled(settings: Settings, standing: Standing) -> bool:
+    """Whether the evaluations end a run: its return is reached, or it makes no progress."""
+    goal, patience = settings.get("stop_at"), settings.get("stop_patience")
+    reached = goal is not None and standing.best is not None and standing.best >= goal
+    return reached or (patience is not None and standing.since >= patience)
+
+
+def is_spent(settings: Settings, step: float, wall_seconds: float, standing: Standing) -> bool:
+    """Whether a run has made all its env steps, is out of time, or is settled."""
     over = step >= budget(settings) or out_of_time(settings, wall_seconds)
-    return over or is_reached(settings, best)
+    return over or is_settled(settings, standing)

@@ -27,6 +27,8 @@ class RunSettings(TypedDict, total=False):
     """stop after this wall time, such as 2h; default no limit"""
     stop_at: float | None
     """stop at the first evaluation whose mean return is this; default never"""
+    stop_patience: int | None
+    """stop after so many evaluations in a row, from the first update on, without a new best..."""
     start_from: str | None
     """earlier run, or policy file, whose networks the members start with"""
     seed: int
@@ -121,6 +123,8 @@ class RunSettings(TypedDict, total=False):
     """share of every learning rate that is left at the end; it falls linearly"""
     lr_horizon: int | str | None
     """env steps until that share is reached; default --steps"""
+    normalize_reward: bool
+    """divide rewards by the running standard deviation of discounted returns"""
     precision: Literal["f32", "bf16"]
     """precision of large matrix products; accumulation is always float32"""
     hidden: Sequence[int]

@@ -77,8 +77,12 @@ class Evaluator:
         policy.save(self.directory.policy_file)
         if keep := self.config.run.keep:
             _keep(policy, self.directory.path / "policies", progress.step, keep)
-        if progress.step > 0 and (progress.best is None or trial.mean > progress.best):
-            progress.best = trial.mean
+        if progress.step == 0:
+            return
+        standing = progress.standing.after(trial.mean, progress.updates)
+        better = standing.best != progress.best
+        progress.best, progress.since_best = standing
+        if better:
             policy.about["score_note"] = "the best of many evaluations, so biased upwards"
             policy.save(self.directory.best_file)
 

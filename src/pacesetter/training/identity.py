@@ -13,7 +13,8 @@ from pacesetter.settings import Settings
 KIND = "checkpoint"
 SCHEMA = 4
 # What a run is given anew by flags of `resume`, or what changes no result of it.
-FREE_ON_RESUME = {"steps", "time", "stop_at", "name", "env_timeout", "checkpoint_every", "device"}
+BUDGETS = {"steps", "time", "stop_at", "stop_patience"}
+FREE_ON_RESUME = BUDGETS | {"name", "env_timeout", "checkpoint_every", "device"}
 
 
 class Refused(UsageError):  # noqa: N818

@@ -19,7 +19,7 @@ from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
 from pacesetter.settings import OnPolicy
-from pacesetter.settings.budget import is_reached, out_of_time
+from pacesetter.settings.budget import is_settled, out_of_time
 from pacesetter.settings.files import read_file
 from pacesetter.training import checkpoint, identity
 from pacesetter.training.evaluator import Evaluator
@@ -100,6 +100,7 @@ class Trainer:
         steps: int | str | None = None,
         time: float | str | None = None,
         stop_at: float | None = None,
+        stop_patience: int | None = None,
         env_timeout: float | str | None = None,
         checkpoint_every: float | str | None = None,
         allow: Iterable[str] = (),
@@ -114,7 +115,11 @@ class Trainer:
         self.directory = find(str(run), runs)
         self.config = self.directory.config(allow)
         given = {"steps": steps, "time": time, "stop_at": stop_at}
-        given |= {"env_timeout": env_timeout, "checkpoint_every": checkpoint_every}
+        given |= {
+            "stop_patience": stop_patience,
+            "env_timeout": env_timeout,
+            "checkpoint_every": checkpoint_every,
+        }
         if changed := {key: value for key, value in given.items() if value is not None}:
             settings = self.config.settings() | changed
             self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
@@ -162,7 +167,7 @@ class Trainer:
                 self._reporter.tell_time()
                 ending = self._spent
                 yield from self._reporter.due(ending)
-                if ending or self._stopping or self._reached:
+                if ending or self._stopping or self._settled:
                     break
                 if self._save_is_due():
                     self.save()
@@ -203,13 +208,13 @@ class Trainer:
     def _spent(self) -> bool:
         """Whether the budget of steps, with the updates that are due, or of time is spent."""
         out = out_of_time(vars(self.config.run), self.progress.wall_seconds)
-        if out or self._reached:
+        if out or self._settled:
             return True
         return self.progress.step >= self.budget and not self.loop.has_due_updates
 
     @property
-    def _reached(self) -> bool:
-        return is_reached(vars(self.config.run), self.progress.best)
+    def _settled(self) -> bool:
+        return is_settled(vars(self.config.run), self.progress.standing)
 
     def stop(self) -> None:
         """Ask for the end, in a tick or an evaluation at most; a signal handler may call it."""

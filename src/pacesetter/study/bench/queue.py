@@ -60,7 +60,8 @@ def is_finished(job: Job) -> bool:
         progress = Progress.load(table["progress"])
     except (UsageError, *storage.FAULTS):
         return False  # nothing yet, or damaged, which `resume` deals with
-    spent = is_spent(vars(job.config.run), progress.step, progress.wall_seconds, progress.best)
+    run, standing = vars(job.config.run), progress.standing
+    spent = is_spent(run, progress.step, progress.wall_seconds, standing)
     return spent and progress.last_evaluation == progress.step
 
 

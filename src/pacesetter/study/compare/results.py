@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.runs.records import check_record
-from pacesetter.settings.budget import budget, is_spent, steps_per_count
+from pacesetter.settings.budget import budget, is_spent, standing, steps_per_count
 from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.stats import Array
@@ -102,8 +102,8 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        best = float(self.returns[self.steps > 0].max(initial=-np.inf))
-        return is_spent(self.settings, self.clock[-1], self.wall[-1], best)
+        now = standing(zip(self.steps, self.returns, self.updates, strict=True))
+        return is_spent(self.settings, self.clock[-1], self.wall[-1], now)
 
     def cut(self, budget: int) -> "Run":
         """The run as it was at a budget."""
