@@ -3,6 +3,7 @@
 import errno
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -237,3 +238,32 @@ def test_a_write_that_fails_leaves_no_litter(
     with pytest.raises(OSError, match="No space"):
         storage.write_atomically(tmp_path / "file", b"1")
     assert not [*tmp_path.iterdir()]
+
+
+def _write_half(name: Path, fail: type[BaseException] | None) -> None:
+    name.write_bytes(b"ne")
+    if fail is not None:
+        raise fail("in the middle")
+    name.write_bytes(b"new")
+
+
+@pytest.mark.parametrize("fail", [None, OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("before", [None, b"old"])
+def test_a_file_that_another_library_writes_is_replaced_whole(
+    fail: type[BaseException] | None, before: bytes | None, tmp_path: Path
+) -> None:
+    file = tmp_path / "film.mp4"
+    if before is not None:
+        file.write_bytes(before)
+    (tmp_path / f"film{storage.TEMPORARY}.mp4").symlink_to(tmp_path / "elsewhere")
+    with suppress(OSError, KeyboardInterrupt), storage.replacing(file) as name:
+        assert name.suffix == ".mp4"
+        _write_half(name, fail)
+    found = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    kept = b"new" if fail is None else before
+    assert found == ({} if kept is None else {"film.mp4": kept})
+
+
+def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="directory"), storage.replacing(tmp_path):
+        raise AssertionError("nothing is to be written")

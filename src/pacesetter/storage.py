@@ -8,7 +8,8 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,6 +134,28 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
             os.fsync(file.fileno())
         if keep is not None and is_regular(path):
             link(path, keep)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """The name of a new file, with the same ending, that takes the place of `path` once written.
+
+    For writers that take a name. If one fails, what was there stays and nothing is left over.
+    """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    temporary = path.with_name(f"{path.stem}{TEMPORARY}{path.suffix}")
+    temporary.unlink(missing_ok=True)
+    open(temporary, "xb", opener=regular).close()  # a refusal comes here, before the work
+    try:
+        yield temporary
+        with open(temporary, "rb", opener=regular) as file:
+            os.fsync(file.fileno())
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)

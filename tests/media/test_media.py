@@ -6,16 +6,18 @@ import os
 import subprocess
 import sys
 import warnings
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from policies import untrained
 
 from pacesetter.envs import Environment
-from pacesetter.errors import UsageError
+from pacesetter.errors import TaskError, UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media.caption import caption
 from pacesetter.media.curve import curve
@@ -164,7 +166,7 @@ def test_mujoco_that_cannot_even_be_imported_is_the_same_line(tmp_path: Path) ->
     code = """
 import sys
 import numpy as np
-from pacesetter.errors import UsageError
+from pacesetter.errors import TaskError, UsageError
 from pacesetter.media.record import record
 from pacesetter.policy import Policy
 one = np.ones((1, 1), np.float32)
@@ -228,6 +230,29 @@ def test_one_episode_by_default_and_drawing_changes_no_return(tmp_path: Path) ->
     assert two == (16, 20.0, evaluate(short(), episodes=2, seed=5).returns)
     cut = record(short(), tmp_path / "cut.gif", size=(64, 48), seed=5, episodes=2, frames=9)
     assert cut == (9, 20.0, two.returns[:1])
+
+
+@pytest.mark.usefixtures("gl")
+@pytest.mark.parametrize("suffix", ["mp4", "gif"])
+def test_a_film_that_fails_leaves_the_one_before(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A task that breaks down in its fifth step costs no film of yesterday, and leaves no part."""
+    (tmp_path / "probe.gif").unlink()
+    film, step, steps = tmp_path / f"film.{suffix}", Environment.step, count()
+    film.write_bytes(b"of yesterday")
+
+    def fail(self: Environment, action: Any) -> Any:
+        if next(steps) == 4:
+            raise TaskError("a bolt fell out")
+        return step(self, action)
+
+    monkeypatch.setattr(Environment, "step", fail)
+    with pytest.raises(TaskError, match="bolt"):
+        record(short(), film, size=(64, 48))
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [
+        (film.name, b"of yesterday")
+    ]
 
 
 @pytest.mark.usefixtures("gl")
@@ -334,3 +359,19 @@ def test_curve_needs_an_evaluation_and_a_known_suffix(tmp_path: Path) -> None:
         curve(run, tmp_path / "curve.walk")
     with pytest.raises(UsageError, match="cannot write"):
         curve(run, tmp_path / "none" / "curve.png")
+
+
+def test_curve_that_fails_leaves_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Figure, path: Path, **how: Any) -> None:
+        Path(path).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", fail)
+    file = tmp_path / "curve.png"
+    file.write_bytes(b"of yesterday")
+    with pytest.raises(UsageError, match="No space"):
+        curve(handmade(tmp_path / "run", [evaluation(0, 1.0)]), file)
+    assert file.read_bytes() == b"of yesterday"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["curve.png", "run"]

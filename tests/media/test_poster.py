@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_media import gl as gl
 from test_media import untrained
 
@@ -93,3 +94,22 @@ def test_bad_input_is_one_line(
     with pytest.raises(UsageError, match=said):
         poster(cheetah, path, **rest)
     assert not path.exists()
+
+
+@pytest.mark.usefixtures("gl")
+def test_a_poster_that_fails_leaves_the_one_before(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(self: Image.Image, path: Path, **how: Any) -> None:
+        Path(path).write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    (tmp_path / "probe.gif").unlink()
+    file = tmp_path / "strip.png"
+    file.write_bytes(b"of yesterday")
+    with pytest.raises(UsageError, match="No space"):
+        poster(cheetah, file, frames=1, size=(64, 48))
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [
+        (file.name, b"of yesterday")
+    ]

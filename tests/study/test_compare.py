@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from compare import make_run
+from matplotlib.figure import Figure
 from scripted_runs import IDLE, start
 from short_runs import run_to_end
 
@@ -619,3 +621,20 @@ def test_the_reported_tables_come_from_the_repository(tmp_path: Path) -> None:
     done = subprocess.run(script, capture_output=True, text=True, check=True)
     assert "# pilot: budget 100k" in done.stdout
     assert (tmp_path / "pilot.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("suffix", ["png", "pdf", "md"])
+def test_a_file_that_cannot_be_written_leaves_the_one_before(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*given: Any, **how: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    for holder, name in ((Figure, "savefig"), (os, "fsync")):
+        monkeypatch.setattr(holder, name, fail)
+    file = tmp_path / f"table.{suffix}"
+    file.write_bytes(b"of yesterday")
+    small(tmp_path / "runs")
+    assert main(["compare", "td3", "-o", str(file)]) == 2
+    assert file.read_bytes() == b"of yesterday"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["runs", file.name]

@@ -5,6 +5,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory
+from pacesetter.storage import replacing
 
 COLOUR = "tab:blue"
 
@@ -28,7 +29,8 @@ def curve(run: RunDirectory, path: str | Path) -> None:
     if path.suffix.removeprefix(".") not in canvas.get_supported_filetypes():
         raise UsageError(f"curve: cannot draw {path}: its name must end in .png, .svg or .pdf")
     try:
-        figure.savefig(path)
+        with replacing(path) as file:
+            figure.savefig(file)
     except OSError as error:
         raise UsageError(f"curve: cannot write {path}: {error.strerror}") from None
 

@@ -3,6 +3,7 @@
 import re
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,11 @@ def to_minari(
         buffers = [_episode(policy, world, number) for number in range(episodes)]
         returns = [float(np.sum(buffer["rewards"])) for buffer in buffers]
         kind = need("minari", "minari.data_collector", INSTALL).EpisodeBuffer
-        # Minari joins a relative folder to itself.
-        root = str(path.parent.resolve())
-        with setting("MINARI_DATASETS_PATH", root), warnings.catch_warnings():
+        with (
+            TemporaryDirectory(dir=path.parent.resolve()) as root,  # it joins a relative to itself
+            setting("MINARI_DATASETS_PATH", root),
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore")  # of fields that may be left out
             minari.create_dataset_from_buffers(
                 path.name,
@@ -53,6 +56,7 @@ def to_minari(
                 algorithm_name=policy.about.get("algorithm"),
                 description=_describe(policy, world.name, returns, seed),
             )
+            Path(root, path.name).rename(path)
     except OSError as error:
         raise UsageError(f"minari: cannot write {path}: {error.strerror or error}") from None
     finally:

@@ -10,6 +10,7 @@ from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene
 from pacesetter.policy import Policy
+from pacesetter.storage import replacing
 
 GAP = 6  # pixels of white between frames
 ALIKE = 0.3  # autocorrelation from which a movement counts as one that repeats
@@ -110,6 +111,7 @@ def _save(path: Path, pictures: list[Frame], steps: list[int]) -> None:
         pen.text((left + width / 2, height + letters), f"step {step:,}", "black", font, "mm")
     try:
         # 256 colours without dithering: a third of the bytes, and nobody sees it.
-        strip.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+        with replacing(path) as file:
+            strip.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
     except OSError as error:
         raise UsageError(f"poster: cannot write {path}: {error.strerror}") from None

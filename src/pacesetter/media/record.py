@@ -12,6 +12,7 @@ from pacesetter.media.caption import caption
 from pacesetter.media.scene import INSTALL as INSTALL
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene, setting
 from pacesetter.policy import Policy
+from pacesetter.storage import replacing
 
 SUFFIXES = (".mp4", ".gif")
 FASTEST = 50.0  # frames per second; a GIF knows no more and eyes see no more
@@ -97,11 +98,11 @@ def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
     first = next(film)  # so that no file is made where nothing can be drawn
     written = 0
     try:
-        path.open("wb").close()  # a refusal comes as one line here, from ffmpeg as many
         # Otherwise ffmpeg is started by a plain fork, which JAX's threads make unsafe.
         with (
+            replacing(path) as file,
             setting("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1"),
-            library.get_writer(path, **_options(path.suffix, rate)) as writer,
+            library.get_writer(file, **_options(path.suffix, rate)) as writer,
         ):
             for frame in chain([first], film):
                 writer.append_data(frame)

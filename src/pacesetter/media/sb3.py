@@ -71,5 +71,6 @@ def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
         policy.save(file)
         write_atomically(path, text.encode())
     except OSError as error:
+        file.unlink(missing_ok=True)
         raise UsageError(f"sb3: cannot write {path}: {error.strerror}") from None
     return file

@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 
 from pacesetter.errors import UsageError
-from pacesetter.storage import write_atomically
+from pacesetter.storage import replacing, write_atomically
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
 from pacesetter.study.report import contents, contrasts, data, paper, tables
@@ -68,7 +68,8 @@ def write(comparison: Comparison, path: Path, options: Options) -> None:
             from pacesetter.study.report import figures
 
             draw = figures.pdf if path.suffix == ".pdf" else figures.picture
-            draw(comparison, path, options.smooth)
+            with replacing(path) as file:
+                draw(comparison, file, options.smooth)
         else:
             write_atomically(path, _page(comparison, path.suffix, options).encode())
     except OSError as error:
