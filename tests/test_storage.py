@@ -140,6 +140,17 @@ def test_without_second_names_two_writes_are_kept_too(
     assert storage.read(file, "thing").table == {"n": 1}
 
 
+def test_a_new_folder_has_its_name_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
+    assert storage.make_folder(tmp_path / "new")
+    assert synced == [tmp_path.stat().st_ino]
+    assert not storage.make_folder(tmp_path / "new")
+    (tmp_path / "file").touch()
+    with pytest.raises(FileExistsError):
+        storage.make_folder(tmp_path / "file")
+
+
 @pytest.mark.parametrize(("answer", "whole"), [(errno.EINVAL, True), (errno.EIO, False)])
 def test_a_folder_that_cannot_be_synced(
     answer: int, whole: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -138,7 +138,7 @@ def write_atomically(path: Path, data: bytes, keep: Path | None = None) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 @contextmanager
@@ -160,10 +160,29 @@ def replacing(path: Path) -> Generator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def _sync_folder(path: Path) -> None:
+def make_folder(path: Path) -> bool:
+    """Make a folder, and its name safe from a power cut; False if it was there."""
+    if path.is_dir():
+        return False
+    try:
+        path.mkdir()
+    except FileExistsError:
+        if not path.is_dir():
+            raise
+        return False
+    try:
+        sync_folder(path.parent)
+    except BaseException:
+        path.rmdir()
+        raise
+    return True
+
+
+def sync_folder(path: Path) -> None:
+    """Make the names in a folder safe from a power cut."""
     folder = os.open(path, os.O_RDONLY)
     try:
         os.fsync(folder)

@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -69,17 +70,29 @@ def fail_at_replay(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fail_at_config(monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_to_sync(monkeypatch, stat.S_ISREG)
+
+
+def fail_at_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    fail_to_sync(monkeypatch, stat.S_ISDIR)
+
+
+def fail_to_sync(monkeypatch: pytest.MonkeyPatch, kind: Callable[[int], bool]) -> None:
     sync = os.fsync
 
     def full(file: int) -> None:
-        if os.fstat(file).st_size > 100:
+        if kind(os.fstat(file).st_mode):
             raise OSError(errno.ENOSPC, "No space left on device")
         sync(file)
 
     monkeypatch.setattr(os, "fsync", full)
 
 
-FAILURES: list[Callable[[pytest.MonkeyPatch], None]] = [fail_at_replay, fail_at_config]
+FAILURES = [
+    fail_at_replay,
+    fail_at_config,
+    fail_at_folder,
+]
 
 
 @pytest.mark.parametrize("fail", FAILURES)
@@ -100,6 +113,14 @@ def test_a_start_that_fails_leaves_what_was_there(
     with pytest.raises(UsageError, match=r"cannot (reserve|write)"):
         Trainer("td3", TASK, runs=runs, **SHORT)
     assert tree(runs.parent) == before
+
+
+def test_litter_of_a_killed_process_is_swept(run: RunDirectory) -> None:
+    for place in (run.path, run.policies, run.state_file.parent):
+        place.mkdir(exist_ok=True)
+        (place / f"file{storage.TEMPORARY}").touch()
+    Trainer.resume(run.path).close()
+    assert not [*run.path.rglob(f"*{storage.TEMPORARY}")]
 
 
 def test_a_name_too_long_leaves_nothing(

@@ -19,6 +19,7 @@ import configurations  # noqa: E402
 import faults  # noqa: E402
 import odd_files  # noqa: E402
 import page  # noqa: E402
+import power_cuts  # noqa: E402
 import processes  # noqa: E402
 import swapped  # noqa: E402
 from attempts import Tally  # noqa: E402
@@ -88,6 +89,15 @@ EXPERIMENTS = (
         faults.run,
         18,
         162,
+        Tally.of_processes,
+    ),
+    Experiment(
+        "power-cuts",
+        "power cuts between operations on files: what was not synced is lost, or a random part",
+        "the newest finished checkpoint, log and policies whole; ends as if undisturbed",
+        power_cuts.run,
+        20,
+        100,
         Tally.of_processes,
     ),
 )

@@ -7,6 +7,7 @@ import configurations
 import faults
 import odd_files
 import page
+import power_cuts
 import processes
 import pytest
 import swapped
@@ -46,6 +47,11 @@ def test_a_signal_at_any_moment(tmp_path: Path) -> None:
 def test_a_number_that_is_none(tmp_path: Path) -> None:
     tally = faults.run(tmp_path, 4, seed=5)
     assert (tally.made, tally.wrong) == (4, [])
+
+
+def test_what_was_not_synced_is_lost(tmp_path: Path) -> None:
+    tally = power_cuts.run(tmp_path, 8, seed=5)
+    assert (tally.made, tally.wrong) == (8, [])
 
 
 def test_an_attempt_sees_what_goes_wrong(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from pacesetter.errors import UsageError
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError
 from pacesetter.replay.sampler import Sampler
-from pacesetter.storage import digest, regular, reserve
+from pacesetter.storage import digest, make_folder, regular, reserve
 from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together
@@ -171,7 +171,7 @@ def open_replays(folder: Path, count: int, layout: Layout, hyper: Any, budget: i
 
 def _map_file(path: Path, size: int) -> mmap.mmap:
     try:
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         file = regular(path, os.O_RDWR | os.O_CREAT)
     except OSError as error:
         raise UsageError(f"{path}: cannot be opened: {error.strerror}") from None

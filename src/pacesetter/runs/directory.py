@@ -22,6 +22,7 @@ from pacesetter.storage import (
     TEMPORARY,
     as_json,
     is_regular,
+    make_folder,
     present,
     read_bytes,
     write_atomically,
@@ -42,6 +43,7 @@ class RunDirectory:
         self.metrics_file = path / "metrics.jsonl"
         self.policy_file = path / "policy.safetensors"
         self.best_file = path / "best.safetensors"
+        self.policies = path / "policies"  # of past evaluations, if they are kept
         self.state_file = path / "last" / "state.safetensors"
         self.previous_file = path / "last" / "previous.safetensors"
         self.log = Log(self.metrics_file)
@@ -129,14 +131,7 @@ class RunDirectory:
     def _make_folders(self) -> None:
         last = self.state_file.parent
         for folder in (*reversed(last.parents), last):
-            if folder.is_dir():
-                continue
-            try:
-                folder.mkdir()
-            except FileExistsError:
-                if not folder.is_dir():
-                    raise
-            else:
+            if make_folder(folder):
                 self._made.insert(0, folder)
 
     def note_resume(self, config: Config, step: int, **found: Any) -> None:
@@ -203,7 +198,7 @@ class RunDirectory:
 
     def sweep(self) -> None:
         """Remove the temporary files of a killed process."""
-        for folder in (self.path, self.state_file.parent):
+        for folder in (self.path, self.policies, self.state_file.parent):
             for leftover in folder.glob(f"*{TEMPORARY}"):
                 try:
                     leftover.unlink()

@@ -8,7 +8,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.runs.records import check_row
-from pacesetter.storage import as_json, present, read_bytes, regular
+from pacesetter.storage import as_json, present, read_bytes, regular, sync_folder
 
 Row = dict[str, Any]
 
@@ -48,6 +48,7 @@ class Log:
         if present(self.path):
             with open(self.path, "ab", opener=regular) as file:
                 os.fsync(file.fileno())
+            sync_folder(self.path.parent)
         data = self.read()
         return len(data), sha256(data).hexdigest()
 

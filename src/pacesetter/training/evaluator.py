@@ -14,6 +14,7 @@ from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
+from pacesetter.storage import make_folder
 from pacesetter.types import Floats
 
 
@@ -76,7 +77,7 @@ class Evaluator:
         policy.about.update(score)
         policy.save(self.directory.policy_file)
         if keep := self.config.run.keep:
-            _keep(policy, self.directory.path / "policies", progress.step, keep)
+            _keep(policy, self.directory.policies, progress.step, keep)
         if progress.step == 0:
             return
         standing = progress.standing.after(trial.mean, progress.updates)
@@ -111,7 +112,7 @@ class Evaluator:
 
 def _keep(policy: Policy, folder: Path, step: int, most: int) -> None:
     """Write the policy of a step, and remove the oldest beyond so many."""
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     policy.save(folder / f"step-{step}.safetensors")
     kept = {int(file.stem[5:]): file for file in folder.glob("step-[0-9]*.safetensors")}
     for old in sorted(kept)[:-most]:

@@ -20,7 +20,7 @@ from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
-from pacesetter.storage import present, write_atomically
+from pacesetter.storage import make_folder, present, sync_folder, write_atomically
 from pacesetter.study.bench.suite import TUNING_SEEDS
 from pacesetter.study.tune.journal import (
     distribution,
@@ -59,10 +59,12 @@ class Tuning:
         settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
         run = self.config.run
         try:
-            self.runs.mkdir(parents=True, exist_ok=True)
+            for folder in (*reversed(self.runs.parents), self.runs):
+                make_folder(folder)
             with alone(self._lock):
                 patience = run.steps // run.eval_every // 3
                 self.study = open_study(self.file, journal, settings, self.ranges, patience)
+            sync_folder(self.file.parent)
         except OSError as error:
             raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
 
