@@ -65,6 +65,7 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
     "sunrise": ("sunrise", NO_ENTROPY | FEW),
     "sunrise-official": ("sunrise", NO_ENTROPY | FEW | OFFICIAL),
     "sunrise-td3": ("sunrise-td3", FEW),
+    "tqc": ("tqc", NO_ENTROPY | {"critics": 2, "dropped": 0}),
     "redq": ("redq:REDQ", NO_ENTROPY | MANY),
     "steve": ("steve", MODELS | {"exploration_noise": 2.0}),
     "steve-td3": ("steve-td3", MODELS),

@@ -21,6 +21,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "multi-td3": PARAMETER | {"assess": 1, "rule": "best"},
     "td3": {"members": 2, "rule": "none", "snapshots": 2},
     "sac": {"members": 2, "rule": "pbt", "select_window": 1, "vary": {"gamma": [0.9, 0.99]}},
+    "tqc": {"critics": 2},
     "crossq": {"critic_hidden": (8,)},
     "sunrise": {"ensemble": 2},
     "ddpg": {},

@@ -23,6 +23,7 @@ TABLE = {
     "td3": _shipped("td3:TD3", "twin delayed DDPG (Fujimoto et al. 2018)"),
     "td7": _shipped("td7:TD7", "TD3 with learned embeddings, LAP, checkpoints"),
     "sac": _shipped("sac:SAC", "soft actor-critic, temperature learned"),
+    "tqc": _shipped("tqc:TQC", "SAC whose target drops the largest of many quantiles"),
     "crossq": _shipped("crossq:CrossQ", "SAC with batch renorm and no targets (Bhatt et al. 2024)"),
     "sunrise": _shipped("sunrise:Sunrise", "an ensemble of SAC learners (Lee et al. 2021)"),
     "sunrise-td3": _shipped("sunrise_td3:SunriseTD3", "SUNRISE's ensemble over TD3"),

@@ -5,11 +5,11 @@ from typing import Any, Literal, TypedDict
 
 # fmt: off
 Name = Literal[
-    "td3", "td7", "sac", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3", "ddpg", "trpo",
-    "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-crossq", "multi-sunrise",
-    "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg", "td3-paper",
-    "ddpg-original", "crossq-small", "crossq-lean", "crossq-bins", "crossq-wn", "td7-small",
-    "sunrise-official", "demo", "steve-paper", "me-trpo-paper"
+    "td3", "td7", "sac", "tqc", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3", "ddpg",
+    "trpo", "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-tqc", "multi-crossq",
+    "multi-sunrise", "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg",
+    "td3-paper", "ddpg-original", "crossq-small", "crossq-lean", "crossq-bins", "crossq-wn",
+    "td7-small", "sunrise-official", "demo", "steve-paper", "me-trpo-paper"
 ]
 # fmt: on
 
@@ -167,6 +167,8 @@ class RunSettings(TypedDict, total=False):
     """temperature at the start"""
     target_entropy: float | None
     """in nats; default minus the action size"""
+    dropped: int
+    """largest quantiles to drop from the target, per critic"""
     critic_hidden: Sequence[int]
     """widths of the critics' hidden layers"""
     adam_momentum: float
