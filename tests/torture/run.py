@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
 import configurations  # noqa: E402
+import disk_full  # noqa: E402
 import faults  # noqa: E402
 import odd_files  # noqa: E402
 import page  # noqa: E402
@@ -89,6 +90,15 @@ EXPERIMENTS = (
         faults.run,
         18,
         162,
+        Tally.of_processes,
+    ),
+    Experiment(
+        "disk-full",
+        "a disk that is full at the start, in training or at a checkpoint, at random sizes",
+        "no checkpoint lost, no litter; one line says it; with room it ends as if undisturbed",
+        disk_full.run,
+        12,
+        50,
         Tally.of_processes,
     ),
     Experiment(

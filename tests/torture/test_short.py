@@ -4,6 +4,7 @@ from datetime import date
 from pathlib import Path
 
 import configurations
+import disk_full
 import faults
 import odd_files
 import page
@@ -47,6 +48,13 @@ def test_a_signal_at_any_moment(tmp_path: Path) -> None:
 def test_a_number_that_is_none(tmp_path: Path) -> None:
     tally = faults.run(tmp_path, 4, seed=5)
     assert (tally.made, tally.wrong) == (4, [])
+
+
+@pytest.mark.parametrize("kind", [disk_full.Limited, None])
+def test_a_full_disk(kind: type[disk_full.Limited] | None, tmp_path: Path) -> None:
+    tally = disk_full.run(tmp_path, 1, seed=3, make=kind)
+    assert tally.wrong == []
+    assert tally.refused > 0
 
 
 def test_what_was_not_synced_is_lost(tmp_path: Path) -> None:
