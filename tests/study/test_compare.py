@@ -115,6 +115,23 @@ def test_a_foreign_line_is_refused(
         compare([file])
 
 
+def test_a_line_without_one_of_its_keys_is_read_or_refused(runs: Path, tmp_path: Path) -> None:
+    line = compact(RunDirectory(runs / "Ant-v5" / "td3" / "0"))
+    file, read = tmp_path / "results.jsonl", 0
+    short = [{k: v for k, v in line.items() if k != key} for key in line]
+    for key in line["settings"]:
+        settings = {k: v for k, v in line["settings"].items() if k != key}
+        short.append(line | {"settings": settings})
+    for each in short:
+        file.write_text(json.dumps(each) + "\n")
+        found = gather([file])
+        read += len(found.runs)
+        assert all(re.search("is missing|no ", why) for why in found.damaged)
+        if found.runs:
+            compare([file])
+    assert 0 < read < len(short)
+
+
 def _no_config(run: RunDirectory) -> None:
     run.config_file.unlink()
     run.config_file.mkdir()

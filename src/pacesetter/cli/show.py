@@ -43,7 +43,7 @@ def tell(run: RunDirectory) -> Row:
     spent = {key: last[key] for key in COUNTS if key in last}
     spent["selections"] = sum(row["kind"] == "select" for row in rows)
     spent |= {key: last[key] for key in TIMES if key in last}
-    made = {key: record[key] for key in MADE}
+    made = {key: record.get(key) for key in MADE}
     return {
         "name": str(run.path),
         **state(run),
@@ -51,7 +51,7 @@ def tell(run: RunDirectory) -> Row:
         "ledger": spent,
         "settings": record["settings"],
         "made": made | {"products": record.get("products") or "xla"},
-        "versions": record["versions"],
+        "versions": record.get("versions", {}),
     }
 
 

@@ -8,7 +8,7 @@ from pacesetter.settings import Settings
 
 def steps_per_count(settings: Settings) -> int:
     """Env steps of all members for each one that `--steps` and the intervals count."""
-    return settings["members"] if settings["count"] == "member" else 1
+    return settings.get("members", 1) if settings.get("count") == "member" else 1
 
 
 def budget(settings: Settings) -> int:
