@@ -111,6 +111,47 @@ def test_signal_to_a_verb_that_saves_nothing(number: int) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (CODES[number], "", "")
 
 
+ENDS = """
+import ctypes, os, sys
+from pacesetter.__main__ import main
+from pacesetter.cli import main as command
+
+def fork_and_exit(words):
+    if os.fork() == 0:
+        ctypes.CDLL(None).exit(7)
+    return os.waitstatus_to_exitcode(os.wait()[1])
+
+command.VERBS.update(
+    c=lambda words: ctypes.CDLL(None).exit(0),
+    locked=lambda words: ctypes.PyDLL(None).exit(0),
+    child=fork_and_exit,
+    fine=lambda words: 0,
+    code=lambda words: 75,
+    fault=lambda words: 1 // 0,
+)
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(
+    ("verb", "code", "said"),
+    [
+        ("c", 1, "has exited"),
+        ("locked", 1, "has exited"),
+        ("child", 7, ""),
+        ("fine", 0, ""),
+        ("code", 75, ""),
+        ("fault", 1, "ZeroDivisionError"),
+    ],
+)
+def test_no_library_ends_the_command_as_if_it_were_done(verb: str, code: int, said: str) -> None:
+    words = [sys.executable, "-c", ENDS, verb]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert said in done.stderr
+    assert bool(said) == bool(done.stderr)
+
+
 def test_a_hangup_that_is_ignored_stays_ignored() -> None:
     """As `nohup` does it; the other signals are taken."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

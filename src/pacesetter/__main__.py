@@ -4,12 +4,21 @@ import os
 import sys
 
 from pacesetter.cli.streams import UNREAD, guard
-from pacesetter.process import interrupt, leave, on_signals
+from pacesetter.process import hold_exit, interrupt, leave, on_signals
 
 
 def main() -> int:
     """Run the command that the process was started with. Returns its exit code."""
     on_signals(leave)
+    done, code = hold_exit(), 1
+    try:
+        code = _command()
+    finally:  # from here on C must not call Python
+        done(code)
+    return code
+
+
+def _command() -> int:
     answer = guard()
     from pacesetter.cli.main import main as command
 

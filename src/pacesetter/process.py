@@ -1,5 +1,6 @@
 """A command's process: its cores, threads and environment, and how signals end it."""
 
+import ctypes
 import os
 import signal
 from collections.abc import Callable, Generator
@@ -25,6 +26,7 @@ KEPT = {
     "JAX_ROCM_VISIBLE_DEVICES",
 }
 _exit = os._exit  # which is another while a task is called
+_kept_for_c: list[Any] = []  # functions that C may call until the process ends
 Handler = Callable[[int, FrameType | None], None]
 
 
@@ -80,6 +82,34 @@ def leave(number: int, frame: FrameType | None) -> None:
 def interrupt(number: int, frame: FrameType | None) -> None:
     """End by an exception, so that files and helpers are closed on the way out."""
     raise Interrupted(number)
+
+
+def hold_exit() -> Callable[[int], None]:
+    """Let no library end this process as if its work were done. Returns what tells that it is.
+
+    A simulator in C that calls exit(0) does so behind Python's back; now it comes with a line and
+    exit code 1. C calls what is registered last first, so the code that is told at the end counts.
+    """
+    process, library = os.getpid(), ctypes.CDLL(None)
+    register: Any = getattr(library, "__cxa_atexit", None)
+    if register is None:
+        return lambda code: None
+    register.argtypes = [ctypes.c_void_p] * 3
+
+    @ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+    def refuse(_: object) -> None:
+        if os.getpid() == process:  # not in a child that a task has forked
+            os.write(2, b"pacesetter: stopped: a library in C, such as a simulator, has exited\n")
+            _exit(1)
+
+    register(ctypes.cast(refuse, ctypes.c_void_p), None, None)
+    _kept_for_c.append(refuse)
+
+    def done(code: int) -> None:
+        library.fflush(None)
+        register(ctypes.cast(library._exit, ctypes.c_void_p), code, None)
+
+    return done
 
 
 def is_signal(error: BaseException) -> bool:

@@ -17,6 +17,7 @@ sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
 import configurations  # noqa: E402
 import disk_full  # noqa: E402
+import exactness  # noqa: E402
 import faults  # noqa: E402
 import odd_files  # noqa: E402
 import page  # noqa: E402
@@ -100,6 +101,15 @@ EXPERIMENTS = (
         12,
         50,
         Tally.of_processes,
+    ),
+    Experiment(
+        "exact",
+        "stopped, killed and resumed at 10 random points of a run: all algorithms, four tasks",
+        "weights, replay, streams and log as those of the run that nobody disturbed, bit for bit",
+        exactness.run,
+        20,
+        80,
+        exactness.told,
     ),
     Experiment(
         "power-cuts",

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import configurations
 import disk_full
+import exactness
 import faults
 import odd_files
 import page
@@ -60,6 +61,12 @@ def test_a_full_disk(kind: type[disk_full.Limited] | None, tmp_path: Path) -> No
 def test_what_was_not_synced_is_lost(tmp_path: Path) -> None:
     tally = power_cuts.run(tmp_path, 8, seed=5)
     assert (tally.made, tally.wrong) == (8, [])
+
+
+def test_disturbed_and_exact(tmp_path: Path) -> None:
+    """Of one algorithm; tests/training has the others, stopped within one process."""
+    tally = exactness.run(tmp_path, 1, seed=5, points=2)
+    assert (tally.made, tally.wrong) == (2, [])
 
 
 def test_an_attempt_sees_what_goes_wrong(tmp_path: Path) -> None:
