@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "helpers"))
 
 import configurations  # noqa: E402
+import crowds  # noqa: E402
 import disk_full  # noqa: E402
 import exactness  # noqa: E402
 import faults  # noqa: E402
@@ -91,6 +92,15 @@ EXPERIMENTS = (
         faults.run,
         18,
         162,
+        Tally.of_processes,
+    ),
+    Experiment(
+        "crowds",
+        "16 processes train one new name, then two resume it; two benches for every tenth name",
+        "one has it, the others are refused; the run is as one process alone makes it",
+        crowds.run,
+        10,
+        100,
         Tally.of_processes,
     ),
     Experiment(

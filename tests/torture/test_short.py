@@ -4,6 +4,7 @@ from datetime import date
 from pathlib import Path
 
 import configurations
+import crowds
 import disk_full
 import exactness
 import faults
@@ -49,6 +50,11 @@ def test_a_signal_at_any_moment(tmp_path: Path) -> None:
 def test_a_number_that_is_none(tmp_path: Path) -> None:
     tally = faults.run(tmp_path, 4, seed=5)
     assert (tally.made, tally.wrong) == (4, [])
+
+
+def test_many_want_one_run(tmp_path: Path) -> None:
+    tally = crowds.run(tmp_path, 2, seed=5, size=4)
+    assert (tally.made, tally.wrong) == (2, [])
 
 
 @pytest.mark.parametrize("kind", [disk_full.Limited, None])
