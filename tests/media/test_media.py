@@ -29,22 +29,6 @@ from pacesetter.runs import RunDirectory
 TOLD = ("MUJOCO_GL", "IMAGEIO_FFMPEG_NO_PREVENT_SIGINT")
 
 
-@pytest.fixture
-def cheetah() -> Policy:
-    return untrained("HalfCheetah-v5")
-
-
-@pytest.fixture
-def gl(cheetah: Policy, tmp_path: Path) -> None:
-    """Skip where this machine cannot draw; MuJoCo needs OpenGL, which pip does not install."""
-    try:
-        record(cheetah, tmp_path / "probe.gif", frames=1)
-    except UsageError as error:
-        if INSTALL not in str(error):
-            raise
-        pytest.skip(str(error))
-
-
 def frames_of(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], dict[str, Any]]:
     """All frames of a film and what its header says."""
     import imageio.v2

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_media import untrained
+from policies import untrained
 
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import enter, evaluate

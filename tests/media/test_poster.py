@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_media import gl as gl
-from test_media import untrained
+from policies import untrained
 
 from pacesetter import load
 from pacesetter.errors import UsageError

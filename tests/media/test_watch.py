@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from test_media import untrained
+from policies import untrained
 
 from pacesetter.errors import UsageError
 from pacesetter.media import watch as module

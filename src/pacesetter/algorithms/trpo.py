@@ -217,9 +217,9 @@ def advantages(batch: Batch, values: Array, next_values: Array, decay: float) ->
     """
     delta = batch.reward + batch.discount * next_values - values
 
-    def step(following: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(next_advantage: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         error, share = inputs
-        advantage = error + share * following
+        advantage = error + share * next_advantage
         return advantage, advantage
 
     share = decay * batch.discount * (1 - batch.last)

@@ -32,26 +32,26 @@ class Apart(StrEnum):
 
 def recorded(record: dict[str, Any]) -> Apart | None:
     """As a run's config.json says it, or None where an older version made that."""
-    said = [each["apart"] for each in (record, *record.get("resumed", [])) if "apart" in each]
-    if said and said[0] not in [*Apart]:
-        raise UsageError(f"apart: must be one of {', '.join(Apart)}, got {show(said[0])}")
-    return Apart(said[0]) if said else None
+    found = [each["apart"] for each in (record, *record.get("resumed", [])) if "apart" in each]
+    if found and found[0] not in [*Apart]:
+        raise UsageError(f"apart: must be one of {', '.join(Apart)}, got {show(found[0])}")
+    return Apart(found[0]) if found else None
 
 
 def notes(apart: Apart, name: str, resumed: bool) -> list[str]:
     """What a person should know of a task when a run begins or is resumed; mostly nothing."""
-    said = SAID_ON_RESUME if resumed else SAID_AT_START
-    return [f"env: {name}: {said[apart]}"] if apart in said else []
+    texts = ON_RESUME if resumed else AT_START
+    return [f"env: {name}: {texts[apart]}"] if apart in texts else []
 
 
 LATER = "a resumed run differs from one that was never stopped"
-SAID_AT_START = {
+AT_START = {
     Apart.BY_RENEWAL: "carries state from one episode to the next, so it is made anew at each; "
     f"--no-renew-env keeps it, and then {LATER}",
     Apart.NOT: f"does not repeat an episode from its seed, so {LATER}; its random numbers should "
     "come from self.np_random",
 }
-SAID_ON_RESUME = {
+ON_RESUME = {
     Apart.UNTESTED: f"is kept from one episode to the next; if it carries state, {LATER}",
     Apart.NOT: f"does not repeat an episode from its seed, so {LATER}",
 }

@@ -27,12 +27,12 @@ class Watchdog(threading.Thread):
 
     def __init__(self) -> None:
         super().__init__(daemon=True, name="watchdog of the task")
-        self.due, self.said = inf, ""
+        self.due, self.message = inf, ""
 
     def run(self) -> None:
         while True:
             if monotonic() > self.due:
-                os.write(2, f"pacesetter: stopped: {self.said}\n".encode())
+                os.write(2, f"pacesetter: stopped: {self.message}\n".encode())
                 _exit(1)
             sleep(GRACE / 10)
 
@@ -56,7 +56,7 @@ def limited(seconds: float, what: str) -> Generator[None]:
     not wake it, or if the call is of another thread.
     """
     dog, wakes = _watchdog(), threading.current_thread() is threading.main_thread()
-    dog.said = f"{what}: it has not returned after {seconds:g} s and cannot be woken"
+    dog.message = f"{what}: it has not returned after {seconds:g} s and cannot be woken"
     dog.due = monotonic() + seconds + GRACE
     if wakes:
         signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
