@@ -88,9 +88,17 @@ def has_saved_beyond(directory: RunDirectory, step: int) -> bool:
 
 
 def kill_and_resume(
-    words: list[str], tmp_path: Path, kills: int, seed: int, program: tuple[str, ...] = ()
+    words: list[str],
+    tmp_path: Path,
+    kills: int,
+    seed: int,
+    program: tuple[str, ...] = (),
+    more: int | None = None,
 ) -> RunDirectory:
-    """Kill a run many times, most of them after it has saved something new; then let it end."""
+    """Kill a run many times, most of them after it has saved something new; then let it end.
+
+    `more` is how many steps it makes after the last kill, by default all of its budget.
+    """
     rng = np.random.default_rng(seed)
     runs, saved = tmp_path / "killed", 0
     for number in range(kills):
@@ -108,7 +116,7 @@ def kill_and_resume(
         step = saved_step(directory)
         assert step > saved if number % 3 else step >= saved
         saved = step
-    trainer = Trainer.resume(directory.path)
+    trainer = Trainer.resume(directory.path, steps=more and saved + more)
     assert trainer.notes == []
     assert trainer.progress.step == saved > 0
     assert litter(directory) == []

@@ -1,5 +1,6 @@
 """The table of docs/reliability.md: a row per experiment, each with the day when it was made."""
 
+import fcntl
 import re
 from collections.abc import Iterable
 from datetime import date
@@ -18,15 +19,23 @@ def row(what: str, target: str, came_out: str, met: bool) -> str:
 
 def write(file: Path, new: str, order: Iterable[str]) -> None:
     """Put one row into the page's table; the others stay, but for experiments not in `order`."""
-    text = file.read_text()
+    with open(file, "r+", encoding="utf-8") as page:
+        fcntl.flock(page, fcntl.LOCK_EX)  # experiments may end at the same time
+        text = _with(page.read(), new, order)
+        page.seek(0)
+        page.write(text)
+        page.truncate()
+
+
+def _with(text: str, new: str, order: Iterable[str]) -> str:
     found = _MARKED.search(text)
     if found is None:
-        raise ValueError(f"{file}: has no marks of a table")
+        raise ValueError(f"no table between {BEGIN} and {END}")
     rows = {_what(line): line for line in found[1].splitlines() if line.startswith("| ")}
     rows |= {_what(new): new}
     lines = [*HEAD, *(rows[what] for what in order if what in rows)]
     table = "\n".join([BEGIN, "", *lines, "", END])
-    file.write_text(text[: found.start()] + table + text[found.end() :])
+    return text[: found.start()] + table + text[found.end() :]
 
 
 def _what(line: str) -> str:

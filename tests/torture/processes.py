@@ -2,19 +2,20 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
-from attempts import Tally, patched
+from attempts import Tally, command, patched
 from short_runs import assert_same
-from stopping import RING, kill_and_resume, litter, only_run
+from stopping import RING, kill_and_resume, litter, only_run, training, wait_for
 
 from pacesetter import storage
-from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.process import CODES
 from pacesetter.replay import buffer
@@ -22,7 +23,8 @@ from pacesetter.runs import find_all
 
 SIZES = ["--hidden", "16", "16", "--batch-size", "16", "--warmup", "200", "--replay-size", "300"]
 FLAGS = [*SIZES, "--eval-episodes", "1", "--eval-every", "2000", "--checkpoint-every", "0.5s", "-q"]
-WORDS = ["train", "multi-td3", "Hopper-v5", "--members", "4", *FLAGS]
+WORDS = ["train", "multi-td3", "Pendulum-v1", "--members", "4", *FLAGS]
+AFTER = 2_000  # steps that a run makes after the last kill
 GONE = 10.0  # seconds within which a process must have ended
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 
@@ -30,13 +32,14 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
 def kills(folder: Path, count: int, seed: int = 0) -> Tally:
     """One run of four learners, killed so often, that must end as one that nobody killed."""
     tally = Tally()
-    words = [*WORDS, "--steps", str(max(20_000, 3_000 * count))]
     with ExitStack() as stack:
         for name, value in RING.items():
             stack.enter_context(patched(buffer, name, value))
         try:
-            killed = kill_and_resume(words, folder, kills=count, seed=seed)
-            assert main([*words, "--runs", str(folder / "whole")]) == 0
+            words = [*WORDS, "--steps", "10M"]
+            killed = kill_and_resume(words, folder, kills=count, seed=seed, more=AFTER)
+            words = [*WORDS, "--steps", str(killed.settings()["steps"])]
+            command(*words, "--runs", folder / "whole")()
             assert_same(only_run(folder / "whole"), killed)
         except AssertionError as error:
             tally.wrong.append(f"kills: {error!s:.200}")
@@ -45,7 +48,7 @@ def kills(folder: Path, count: int, seed: int = 0) -> Tally:
 
 
 def signals(folder: Path, count: int, seed: int = 0) -> Tally:
-    """So many runs, each sent one signal at a moment from its first instruction on."""
+    """So many runs, each sent one signal: half from the first instruction on, half in training."""
     rng, tally = random.Random(seed), Tally()
     for each in SIGNALS:  # a child would inherit what nohup or a shell makes this process ignore
         if signal.getsignal(each) is signal.SIG_IGN:
@@ -60,22 +63,26 @@ def signals(folder: Path, count: int, seed: int = 0) -> Tally:
             text=True,
             env=dict(os.environ),
         )
-        moment = rng.uniform(0.05, 12)
+        if in_training := number // len(SIGNALS) % 2 == 1:
+            wait_for(partial(training, runs), process)
+        moment = rng.uniform(0, 1) if in_training else rng.uniform(0.05, 3)
         time.sleep(moment)
         process.send_signal(sent)
+        when = f"{sent.name} {moment:.1f} s after {'saving' if in_training else 'its start'}"
         began = time.monotonic()
         try:
             _, err = process.communicate(timeout=GONE)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-            tally.wrong.append(f"{sent.name} after {moment:.1f} s: not gone in {GONE:.0f} s")
+            tally.wrong.append(f"{when}: not gone in {GONE:.0f} s")
             continue
         finally:
             tally.made += 1
         tally.slowest = max(tally.slowest, time.monotonic() - began)
         if fault := _fault(process.returncode, sent, err, runs):
-            tally.wrong.append(f"{sent.name} after {moment:.1f} s: {fault}")
+            tally.wrong.append(f"{when}: {fault}")
+        shutil.rmtree(runs, ignore_errors=True)
     return tally
 
 

@@ -1,14 +1,18 @@
 """Run the experiments and write what came out into the table of docs/reliability.md.
 
 `python tests/torture/run.py` takes minutes, with `--long` an hour; `make torture` calls it. Names
-of experiments run these alone, and the other rows of the table stay.
+of experiments run these alone, and the other rows of the table stay. Each is a process of its own.
 """
 
 import argparse
+import os
+import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -139,20 +143,30 @@ def main() -> int:
     names = [each.name for each in EXPERIMENTS]
     command.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}")
     command.add_argument("--long", action="store_true", help="the sizes of the targets")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    jobs = "experiments at once (default one per core)"
+    command.add_argument("--jobs", type=int, default=cores, metavar="N", help=jobs)
     given = command.parse_args()
     if unknown := {*given.names} - {*names}:
         command.error(f"no experiment has the name {min(unknown)}")
-    warnings.simplefilter("ignore")
-    passed = [
-        _run(each, each.long if given.long else each.short)
-        for each in EXPERIMENTS
-        if not given.names or each.name in given.names
-    ]
-    return 0 if all(passed) else 1
+    if len(given.names) == 1:
+        (each,) = (each for each in EXPERIMENTS if each.name in given.names)
+        return 0 if _run(each, each.long if given.long else each.short) else 1
+    with ThreadPoolExecutor(given.jobs) as pool:
+        codes = [*pool.map(partial(_in_its_own, long=given.long), given.names or names)]
+    return 1 if any(codes) else 0
+
+
+def _in_its_own(name: str, long: bool) -> int:
+    words = [sys.executable, __file__, name, *(["--long"] if long else [])]
+    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    print(done.stdout, end="", flush=True)
+    return done.returncode
 
 
 def _run(each: Experiment, size: int) -> bool:
     """Make one experiment, print its faults and write its row; whether its target was met."""
+    warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
         tally = each.make(Path(folder), size)
     told = each.told(tally)
