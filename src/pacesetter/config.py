@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
@@ -18,11 +18,14 @@ from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settings, budget
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import build, fields_of
-from pacesetter.settings.values import Count, Duration
+from pacesetter.settings.values import Count, Duration, values_by_name
 from pacesetter.text import check_id
 
 if TYPE_CHECKING:
     from pacesetter.envs import Recipe
+
+
+TWO_VALUES = "needs its lowest and its highest value"
 
 
 def _check_json(value: dict[str, Any]) -> dict[str, Any]:
@@ -30,6 +33,21 @@ def _check_json(value: dict[str, Any]) -> dict[str, Any]:
         json.dumps(value)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"must be plain numbers, words, lists and tables: {error}") from None
+    return value
+
+
+def _pairs(value: object) -> Any:
+    table = values_by_name(value)
+    for name, numbers in table.items():
+        if not isinstance(numbers, (list, tuple)) or len(list(numbers)) != 2:
+            raise ValueError(f"{name} {TWO_VALUES}, as {name}=0.8,1.2")
+    return table
+
+
+def _ordered(value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    for name, (low, high) in value.items():
+        if low > high:
+            raise ValueError(f"{name} {TWO_VALUES}, in this order")
     return value
 
 
@@ -45,6 +63,13 @@ class Task:
     )
     env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
         default_factory=dict, description="keywords for gymnasium.make"
+    )
+    randomize: Annotated[
+        dict[str, tuple[float, float]], BeforeValidator(_pairs), AfterValidator(_ordered)
+    ] = Field(
+        default_factory=dict,
+        description="keywords of the task drawn anew for each training episode, such as "
+        "mass=0.8,1.2; may be repeated; evaluations keep --env.KEY",
     )
     name: str = Field(pattern=r"^\w[\w.-]*$", description="name of the run's folder, below its env")
     steps: Count = Field(1_000_000, ge=1, description="budget of env steps, all members together")
@@ -198,6 +223,10 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             hyper = replace(hyper, lr_horizon=run.steps)
     if isinstance(hyper, OnPolicy):
         _refuse_ensemble(run)
+        if run.randomize and getattr(hyper, "known", False):
+            raise UsageError(
+                "randomize: --known takes the reward of one task, not of many; give --no-known"
+            )
         rollout = hyper.parallel_envs * hyper.rollout_length
         if run.steps < rollout:
             raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")

@@ -429,7 +429,7 @@ def test_every_flag_is_tried() -> None:
     """A new setting needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
     settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
-    own_tests = {"start_from", "wrap"}  # which need a run, and a module of wrappers
+    own_tests = {"start_from", "wrap", "randomize"}  # which need a run, a module, a keyword
     assert settings - tried == {"algorithm", "env", "env_kwargs"} | own_tests
 
 

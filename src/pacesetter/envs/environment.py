@@ -1,6 +1,8 @@
 """One env and its running episode: float32, actions in [-1, 1], seeded and resumed exactly."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +15,7 @@ from pacesetter.envs.tasks import Recipe
 from pacesetter.envs.wrappers import notes_on_wrappers
 from pacesetter.errors import TaskError, UsageError
 from pacesetter.policy import to_env
-from pacesetter.seeding import Stream, episode_seed
+from pacesetter.seeding import Range, Stream, draw_task, episode_seed
 from pacesetter.types import Floats
 
 MAX_EPISODE = 100_000  # steps; an episode that never ends would hang every evaluation
@@ -32,11 +34,18 @@ class Environment:
 
     Each reset is seeded by the episode's number. An episode is therefore restored by its number and
     its actions, whatever the simulator is. One that carries state from one episode to the next is
-    made anew at each.
+    made anew at each, and so is one whose keywords are drawn from `ranges`.
     """
 
-    def __init__(self, recipe: Recipe, seed: int, stream: Stream, index: int = 0) -> None:
-        self.recipe, self.env = recipe, recipe.make()
+    def __init__(
+        self,
+        recipe: Recipe,
+        seed: int,
+        stream: Stream,
+        index: int = 0,
+        ranges: Mapping[str, Range] = MappingProxyType({}),
+    ) -> None:
+        self.recipe, self.ranges, self.env = recipe, ranges, recipe.make()
         self.name, self.seed, self.stream, self.index = recipe.name, seed, stream, index
         space: Any = self.env.action_space
         self.low, self.high = action_bounds(self.env)
@@ -56,9 +65,8 @@ class Environment:
     def reset(self, episode: int | None = None) -> Floats:
         """Start an episode by its number, by default the next one."""
         episode = self.episode + 1 if episode is None else episode
-        if self.recipe.renew and not self.new:
-            self.close()
-            self.env = self._call("episode", self.recipe.make)
+        if self.ranges or (self.recipe.renew and not self.new):
+            self._renew(episode)
         self.new = False
         seed = episode_seed(self.seed, self.stream, self.index, episode)
         result: Any = self._call("reset", self.env.reset, seed=seed)
@@ -122,6 +130,15 @@ class Environment:
 
     def close(self) -> None:
         self._call("close", self.env.close)
+
+    def _renew(self, episode: int) -> None:
+        """Make the task anew, with an episode's own keywords if they are drawn."""
+        drawn = draw_task(self.seed, self.stream, self.index, episode, self.ranges)
+        recipe = replace(self.recipe, kwargs=self.recipe.kwargs | drawn)
+        self.close()
+        self.env = self._call("episode", recipe.make)
+        if not np.array_equal(action_bounds(self.env), (self.low, self.high)):
+            raise self._broken(f"episode: its action space changed with {drawn}")
 
     def _call(self, what: str, function: Callable[..., Any], *given: Any, **named: Any) -> Any:
         limit = self.recipe.timeout

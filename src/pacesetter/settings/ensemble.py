@@ -1,6 +1,6 @@
 """Settings of members that share a replay, which a learner on rollouts has not."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
@@ -9,7 +9,7 @@ from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import unknown
 from pacesetter.learner.scales import VARIABLE
 from pacesetter.settings import STRICT
-from pacesetter.settings.values import Count
+from pacesetter.settings.values import Count, values_by_name
 
 SELECT_EVERY = 5_000  # env steps
 WINDOWS = {"rescue": 5, "pbt": 5}  # episodes behind a selection, where the default is not one
@@ -32,24 +32,6 @@ def _check_window(value: int | None, info: ValidationInfo) -> int | None:
     if value == 1 and info.data.get("rule") in SPREAD_RULES:
         raise ValueError("--rule rescue compares members by their spread; at least 2 episodes")
     return value
-
-
-def _values_by_name(value: Any) -> Any:
-    """Words such as gamma=0.98,0.99 as a table; a table from a file as it is."""
-    if isinstance(value, dict):
-        return {str(name).replace("-", "_"): each for name, each in value.items()}
-    if not isinstance(value, (list, tuple)):
-        raise ValueError("must be NAME=VALUE,VALUE or a table of lists")
-    found: dict[str, list[str]] = {}
-    for word in map(str, value):
-        name, sign, values = word.partition("=")
-        name = name.replace("-", "_")
-        if not (name and sign and values):
-            raise ValueError("must be NAME=VALUE,VALUE, such as gamma=0.98,0.99")
-        if name in found:
-            raise ValueError(f"has {name} twice; give all its values at once")
-        found[name] = values.split(",")
-    return found
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -92,7 +74,7 @@ class Ensemble:
     replay_scope: Literal["shared", "member"] = Field(
         "shared", description="one shared replay, or one per member"
     )
-    vary: Annotated[dict[str, tuple[float, ...]], BeforeValidator(_values_by_name)] = Field(
+    vary: Annotated[dict[str, tuple[float, ...]], BeforeValidator(values_by_name)] = Field(
         default_factory=dict,
         description="settings that differ between members, such as gamma=0.98,0.99; may be "
         f"repeated; one of {', '.join(VARIABLE)}",

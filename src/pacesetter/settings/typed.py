@@ -19,6 +19,8 @@ class RunSettings(TypedDict, total=False):
 
     env_kwargs: dict[str, Any]
     """keywords for gymnasium.make"""
+    randomize: dict[str, Any]
+    """keywords of the task drawn anew for each training episode, such as mass=0.8,1.2; may..."""
     name: str
     """name of the run's folder, below its env"""
     steps: int | str

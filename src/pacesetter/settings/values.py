@@ -28,6 +28,24 @@ def _duration(value: object) -> object:
     return value if found is None else float(found[1]) * _SECONDS[found[2]]
 
 
+def values_by_name(value: Any) -> Any:
+    """Words such as gamma=0.98,0.99 as a table; a table from a file as it is."""
+    if isinstance(value, dict):
+        return {str(name).replace("-", "_"): each for name, each in value.items()}
+    if not isinstance(value, (list, tuple)):
+        raise ValueError("must be NAME=VALUE,VALUE or a table of lists")
+    found: dict[str, list[str]] = {}
+    for word in map(str, value):
+        name, sign, values = word.partition("=")
+        name = name.replace("-", "_")
+        if not (name and sign and values):
+            raise ValueError("must be NAME=VALUE,VALUE, such as gamma=0.98,0.99")
+        if name in found:
+            raise ValueError(f"has {name} twice; give all its values at once")
+        found[name] = values.split(",")
+    return found
+
+
 class Tune(NamedTuple):
     """The range in which `tune` searches a setting: two numbers, or False and True."""
 

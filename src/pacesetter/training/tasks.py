@@ -1,6 +1,7 @@
 """The envs that a run trains in, and how it keeps their episodes apart."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from pacesetter.config import Config
@@ -31,7 +32,8 @@ def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) 
     recipe = replace(recipe, renew=how is Apart.BY_RENEWAL)
     on_policy = isinstance(hyper, OnPolicy)
     count = hyper.parallel_envs if on_policy else run.members * hyper.num_envs
-    envs = [Environment(recipe, run.seed, Stream.TRAIN, index) for index in range(count)]
+    world = partial(Environment, recipe, run.seed, Stream.TRAIN, ranges=run.randomize)
+    envs = [world(index=index) for index in range(count)]
     cast = envs[0].check()
     notes = [] if before else cast
     if isinstance(env, str) and env != run.env:
