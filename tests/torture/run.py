@@ -94,7 +94,7 @@ EXPERIMENTS = (
         "NaN, infinity or 1e38 as observation, reward, action, loss, weight or moment",
         "found within 100 calls of an update, named by place, member and step; in no file",
         faults.run,
-        18,
+        54,
         162,
         Tally.of_processes,
     ),
