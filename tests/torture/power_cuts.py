@@ -1,5 +1,6 @@
 """Experiment: the power fails, and what was not synced is forgotten: data, names and folders."""
 
+import errno
 import mmap
 import os
 import random
@@ -175,7 +176,7 @@ def run(folder: Path, count: int, seed: int = 0) -> Tally:
             stack.enter_context(patched(buffer, name, value))
         whole = run_to_end(_new(folder / "whole"))
         for session in range(count):
-            cuts = _session(folder / str(session), count - tally.made, rng)
+            cuts = _session(folder / str(session), count - tally.made, rng, session % 2 == 0)
             for cut in cuts:
                 fault = cut.fault(whole, to_end=tally.made % 5 == 0)
                 tally.made += 1
@@ -186,8 +187,12 @@ def run(folder: Path, count: int, seed: int = 0) -> Tally:
     return tally
 
 
-def _session(folder: Path, most: int, rng: random.Random) -> list[Cut]:
-    """One run from its start to its end, and at most so many cuts of it."""
+def _session(folder: Path, most: int, rng: random.Random, links: bool) -> list[Cut]:
+    """One run from its start to its end, and at most so many cuts of it.
+
+    Without second names of files, a checkpoint is renamed, which a file system does as a whole.
+    """
+    shares = (0, 0, 0.5, 1) if links else (0, 1)
     root = folder / "disk"
     root.mkdir(parents=True)
     disk, cuts, made, busy = Disk(root, rng), list[Cut](), list[int](), list[bool]()
@@ -197,16 +202,23 @@ def _session(folder: Path, most: int, rng: random.Random) -> list[Cut]:
             return
         busy.append(True)
         cuts.append(Cut(folder / str(len(cuts)), made[-1] if made else None))
-        disk.leave(cuts[-1].folder, rng.choice([0, 0, 0.5, 1]))
+        disk.leave(cuts[-1].folder, rng.choice(shares))
         busy.clear()
 
-    with recorded(disk, maybe_cut):
+    with ExitStack() as stack:
+        if not links:
+            stack.enter_context(patched(os, "link", _no_link))
+        stack.enter_context(recorded(disk, maybe_cut))
         trainer = _new(root / "runs")
         made.append(0)
         run_to_step(_saving(trainer, made), SETTINGS["steps"] // 2)
         run_to_end(_saving(Trainer.resume(trainer.directory.path), made))
     disk.close()
     return cuts
+
+
+def _no_link(*names: object) -> None:
+    raise OSError(errno.EPERM, os.strerror(errno.EPERM))
 
 
 def _new(runs: Path) -> Trainer:
