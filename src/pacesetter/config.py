@@ -1,15 +1,14 @@
 """The settings of a run: merged from defaults, presets, files and flags, and checked once."""
 
-import json
 import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from pacesetter import algorithms
@@ -17,91 +16,12 @@ from pacesetter.ensemble import varied
 from pacesetter.errors import UsageError, unknown
 from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settings, budget
 from pacesetter.settings.ensemble import Ensemble
+from pacesetter.settings.task import Task
 from pacesetter.settings.validation import build, fields_of
-from pacesetter.settings.values import Count, Duration, values_by_name
-from pacesetter.text import check_id
+from pacesetter.settings.values import Count, Duration
 
 if TYPE_CHECKING:
     from pacesetter.envs import Recipe
-
-
-TWO_VALUES = "needs its lowest and its highest value"
-
-
-def _check_json(value: dict[str, Any]) -> dict[str, Any]:
-    try:
-        json.dumps(value)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"must be plain numbers, words, lists and tables: {error}") from None
-    return value
-
-
-def _pairs(value: object) -> Any:
-    table = values_by_name(value)
-    for name, numbers in table.items():
-        if not isinstance(numbers, (list, tuple)) or len(list(numbers)) != 2:
-            raise ValueError(f"{name} {TWO_VALUES}, as {name}=0.8,1.2")
-    return table
-
-
-def _ordered(value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    for name, (low, high) in value.items():
-        if low > high:
-            raise ValueError(f"{name} {TWO_VALUES}, in this order")
-    return value
-
-
-@dataclass(frozen=True, kw_only=True, config=STRICT)
-class Task:
-    """What to train, where, and for how long."""
-
-    algorithm: Annotated[str, AfterValidator(check_id)] = Field(
-        description="algorithm; see `pacesetter list algorithms`"
-    )
-    env: Annotated[str, AfterValidator(check_id)] = Field(
-        description="Gymnasium id with its version, or module:Id-v0"
-    )
-    env_kwargs: Annotated[dict[str, Any], AfterValidator(_check_json)] = Field(
-        default_factory=dict, description="keywords for gymnasium.make"
-    )
-    randomize: Annotated[
-        dict[str, tuple[float, float]], BeforeValidator(_pairs), AfterValidator(_ordered)
-    ] = Field(
-        default_factory=dict,
-        description="keywords of the task drawn anew for each training episode, such as "
-        "mass=0.8,1.2; may be repeated; evaluations keep --env.KEY",
-    )
-    name: str = Field(pattern=r"^\w[\w.-]*$", description="name of the run's folder, below its env")
-    steps: Count = Field(1_000_000, ge=1, description="budget of env steps, all members together")
-    time: Duration | None = Field(
-        None, gt=0, description="stop after this wall time, such as 2h; default no limit"
-    )
-    stop_at: float | None = Field(
-        None, description="stop at the first evaluation whose mean return is this; default never"
-    )
-    stop_patience: int | None = Field(
-        None,
-        ge=1,
-        description="stop after so many evaluations in a row, from the first update on, without "
-        "a new best mean return; default never",
-    )
-    start_from: str | None = Field(
-        None,
-        min_length=1,
-        description="earlier run, or policy file, whose networks the members start with",
-    )
-    seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
-    env_timeout: Duration | None = Field(
-        None, gt=0, description="longest time of a task's step or reset, such as 30s; default any"
-    )
-    wrap: tuple[str, ...] = Field(
-        (), description="wrappers around the task, module:Class, the innermost first; repeatable"
-    )
-    renew_env: bool | None = Field(
-        None,
-        description="make the task anew at each episode, so that none depends on those before it; "
-        "default where a test at the start finds that one would",
-    )
 
 
 @dataclass(frozen=True, kw_only=True, config=STRICT)
@@ -111,7 +31,7 @@ class Run(Ensemble, Task):
     eval_every: Count = Field(5_000, ge=1, description="env steps between evaluations")
     eval_episodes: int = Field(10, ge=1, description="episodes per evaluation")
     keep: int = Field(
-        0, ge=0, description="policies of the last evaluations to keep in the folder policies/"
+        0, ge=0, description="keep the policies of this many last evaluations in policies/"
     )
     checkpoint_every: Duration = Field(
         60.0, gt=0, description="time between checkpoints, such as 5m"

@@ -75,7 +75,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_log(self) -> None:
         """`--log`, for verbs that train."""
-        tools = f"{', '.join(SINKS)} or {NONE}; default those that the run has"
+        tools = f"{', '.join(SINKS)} or {NONE}; default none, or those of a resumed run"
         about = f"also send the log to these trackers, separated by commas ({tools})"
         self.add_argument("--log", metavar="TOOLS", help=about)
 
@@ -146,7 +146,7 @@ def add_settings(
 def _help(name: str, info: Any, defaults: Settings | None) -> str:
     """Description (range; default X); the description itself says what a default of None means."""
     notes = _allowed(info)
-    if defaults is not None and defaults[name] not in (None, {}):
+    if defaults is not None and defaults[name] not in (None, {}, ()):
         notes.append(f"default {_show(defaults[name])}")
     text = f"{info.description} ({'; '.join(notes)})" if notes else info.description
     return text.replace("%", "%%")

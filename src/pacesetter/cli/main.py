@@ -90,7 +90,7 @@ def _overview() -> str:
             "",
             *lines,
             "",
-            "Start with `pacesetter train multi-td3 HalfCheetah-v5`.",
+            "Start with `pacesetter train crossq-small HalfCheetah-v5 --steps 100k`.",
             "`pacesetter VERB --help` tells more about a verb.",
         ]
     )

@@ -82,7 +82,9 @@ def _resumed_trainer(words: list[str]) -> Command:
     """The old run of `resume WORDS`."""
     from pacesetter.runs import find
 
-    command = parser("resume", "Continue a run from its last checkpoint, exactly as it would have.")
+    command = parser(
+        "resume", "Continue a run from its last checkpoint, exactly as if it had never stopped."
+    )
     command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
     add = command.add_argument
     add("--steps", metavar="N", help="new budget of env steps, such as 2M")

@@ -69,7 +69,7 @@ class Ensemble:
         "all", description="count --steps and intervals over all members, or per member"
     )
     wait: bool = Field(
-        True, description="a member whose episode has ended waits until all have ended"
+        True, description="let a member whose episode has ended wait until all have ended"
     )
     replay_scope: Literal["shared", "member"] = Field(
         "shared", description="one shared replay, or one per member"
@@ -81,19 +81,19 @@ class Ensemble:
     )
     vary_by: Literal["grid", "draw"] = Field(
         "grid",
-        description="give members the points of the grid of --vary, or draw each value as often",
+        description="spread members over the grid of --vary, or draw every value equally often",
     )
     mean_actions: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="also evaluate the mean action of all members and that of their EMA actors; "
-        "auto: of several members",
+        description="also evaluate the mean action of all members, and that of their EMA actors; "
+        "auto: with several members",
     )
     ema_tau: float = Field(0.005, gt=0, le=1, description="step of the EMA actors per actor update")
     snapshots: int = Field(
         0,
         ge=0,
         le=100,
-        description="last evaluated champions whose mean action is evaluated too; 0 evaluates none",
+        description="also evaluate the mean action of this many last evaluated champions",
     )
 
     @property

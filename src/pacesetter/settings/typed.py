@@ -19,8 +19,6 @@ class RunSettings(TypedDict, total=False):
 
     env_kwargs: dict[str, Any]
     """keywords for gymnasium.make"""
-    randomize: dict[str, Any]
-    """keywords of the task drawn anew for each training episode, such as mass=0.8,1.2; may..."""
     name: str
     """name of the run's folder, below its env"""
     steps: int | str
@@ -28,19 +26,21 @@ class RunSettings(TypedDict, total=False):
     time: float | str | None
     """stop after this wall time, such as 2h; default no limit"""
     stop_at: float | None
-    """stop at the first evaluation whose mean return is this; default never"""
+    """stop when an evaluation reaches this mean return; default never"""
     stop_patience: int | None
     """stop after so many evaluations in a row, from the first update on, without a new best..."""
     start_from: str | None
-    """earlier run, or policy file, whose networks the members start with"""
+    """start all members with the networks of this earlier run or policy file"""
     seed: int
     """seed of every random stream"""
     env_timeout: float | str | None
-    """longest time of a task's step or reset, such as 30s; default any"""
+    """end a run whose task takes longer for a step or reset, such as 30s; default no limit"""
     wrap: Sequence[str]
-    """wrappers around the task, module:Class, the innermost first; repeatable"""
+    """put wrappers around the task, the innermost first; may be repeated"""
     renew_env: bool | None
     """make the task anew at each episode, so that none depends on those before it; default..."""
+    randomize: dict[str, Any]
+    """draw a keyword of the task anew for each training episode, such as mass=0.8,1.2; may..."""
     members: int
     """ensemble members: learners that share the replay"""
     rule: str
@@ -62,25 +62,25 @@ class RunSettings(TypedDict, total=False):
     count: Literal["all", "member"]
     """count --steps and intervals over all members, or per member"""
     wait: bool
-    """a member whose episode has ended waits until all have ended"""
+    """let a member whose episode has ended wait until all have ended"""
     replay_scope: Literal["shared", "member"]
     """one shared replay, or one per member"""
     vary: dict[str, Any]
     """settings that differ between members, such as gamma=0.98,0.99; may be repeated; one of..."""
     vary_by: Literal["grid", "draw"]
-    """give members the points of the grid of --vary, or draw each value as often"""
+    """spread members over the grid of --vary, or draw every value equally often"""
     mean_actions: Literal["auto", "on", "off"]
-    """also evaluate the mean action of all members and that of their EMA actors; auto: of..."""
+    """also evaluate the mean action of all members, and that of their EMA actors; auto: with..."""
     ema_tau: float
     """step of the EMA actors per actor update"""
     snapshots: int
-    """last evaluated champions whose mean action is evaluated too; 0 evaluates none"""
+    """also evaluate the mean action of this many last evaluated champions"""
     eval_every: int | str
     """env steps between evaluations"""
     eval_episodes: int
     """episodes per evaluation"""
     keep: int
-    """policies of the last evaluations to keep in the folder policies/"""
+    """keep the policies of this many last evaluations in policies/"""
     checkpoint_every: float | str
     """time between checkpoints, such as 5m"""
     device: Literal["auto", "cpu", "gpu", "tpu"]
