@@ -1,7 +1,7 @@
 """Whether another library makes an update's matrix products quicker than XLA does.
 
     python benchmarks/products.py
-    python benchmarks/products.py --updates     whole updates, by pacesetter's own two ways
+    python benchmarks/products.py --updates     whole updates, in each way that pacesetter can make them
 
 The products are read out of the updates themselves. Each is timed alone, a few independent ones a
 call, and the best of many short repeats counts; the libraries take turns. XLA may take the sides of
@@ -40,13 +40,13 @@ from pacesetter import algorithms
 from pacesetter.batch import Layout as Rows
 from pacesetter.config import resolve
 from pacesetter.learner.precision import SMALL
-from pacesetter.learner.products import VARIABLE
-from pacesetter.learner.products import library as built_in
+from pacesetter.learner.products import LIBRARIES, VARIABLE, loaded
 
 NAMES = ("td3", "sac", "crossq-small")
 BATCHES = (64, 128, 256, 512)
 DECISIVE = (128, 256)  # the batches that decide, both of them
 PRECISIONS = ("f32", "bf16")
+KINDS = (("f32", "xla"), ("f32", "libxsmm"), ("bf16", "xla"), ("bf16", "onednn"))  # of updates
 GOALS = {("f32", 1): 1.3, ("bf16", 1): 2.0, ("f32", 2): 1.5, ("bf16", 2): 1.5}  # over XLA
 WRONG = {"f32": 1e-5, "bf16": 1e-2}  # a relative error that says a product is another one
 SAID = re.compile("error|cannot find")  # in the line of the compiler that matters
@@ -412,27 +412,26 @@ def rate(counts: Counter[Product], took: dict[Product, float]) -> float:
 
 
 def updates(rounds: int) -> list[list[Any]]:
-    """Name, batch, the most updates/s of either way, and the ratio of both and its median.
+    """Name, batch, and for each of KINDS the most updates/s and the ratio to XLA in float32.
 
-    The two take turns in this process, each for a few hundredths of a second.
+    They take turns in this process, each for a few hundredths of a second.
     """
-    if not built_in():
-        raise SystemExit("products.py: libxsmm is not built in (docs/products.md)")
+    for name in LIBRARIES:
+        if not loaded(name):
+            raise SystemExit(f"products.py: {name} is not built in (docs/products.md)")
     found: list[list[Any]] = []
     for name, batch in itertools.product(NAMES, BATCHES[:-1]):
         cycles: list[tuple[Callable[[], Any], int]] = []
-        for value in ("xla", "libxsmm"):
+        for precision, value in KINDS:
             os.environ[VARIABLE] = value
-            call, _, made = whole(name, SPECS["HalfCheetah-v5"], 1, batch_size=batch)
+            spec = SPECS["HalfCheetah-v5"]
+            call, _, made = whole(name, spec, 1, batch_size=batch, precision=precision)
             timed(call, 3)
             cycles.append((call, made))
         rates = np.array(
             [[made / timed(call, 16 // made) for call, made in cycles] for _ in range(rounds)]
-        )
-        xla, libxsmm = rates.max(axis=0)
-        found.append(
-            [name, batch, xla, libxsmm, libxsmm / xla, np.median(rates[:, 1] / rates[:, 0])]
-        )
+        ).max(axis=0)
+        found.append([name, batch, *(f"{rate:.0f} ({rate / rates[0]:.2f})" for rate in rates)])
     return found
 
 
@@ -492,7 +491,7 @@ def main() -> None:
     """Print the table, then for each library whether it is worth its while."""
     parser = argparse.ArgumentParser(description="Time the products of updates.")
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--updates", action="store_true", help="time whole updates, both ways")
+    parser.add_argument("--updates", action="store_true", help="time whole updates, in every way")
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.measure:
@@ -502,17 +501,9 @@ def main() -> None:
     if chosen.updates:
         rows_of = {cores: on_cores(cores, chosen.rounds, "--updates") for cores in counts}
         lines = [[cores, *row] for cores, found in rows_of.items() for row in found]
-        headers = [
-            "cores",
-            "algorithm",
-            "batch",
-            "XLA",
-            "libxsmm",
-            "best over best",
-            "median ratio",
-        ]
-        shapes = ("", "", "", ".0f", ".0f", ".2f", ".2f")
-        print(tabulate(lines, headers, "github", floatfmt=shapes))
+        kinds = [f"{value}, {precision}" for precision, value in KINDS]
+        headers = ["cores", "algorithm", "batch", *kinds]
+        print(tabulate(lines, headers, "github", disable_numparse=True))
         return
     every = {cores: on_cores(cores, chosen.rounds) for cores in counts}
     processor = subprocess.run("lscpu", capture_output=True, text=True, check=True).stdout

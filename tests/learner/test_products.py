@@ -1,4 +1,4 @@
-"""Products by libxsmm: equal to NumPy's whatever their shape, repeatable, and only where asked."""
+"""Products by libxsmm and oneDNN: NumPy's whatever their shape, repeatable, only where asked."""
 
 import subprocess
 import sys
@@ -19,14 +19,26 @@ from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.learner import products
 from pacesetter.learner.compiled import CompiledLearner
-from pacesetter.learner.products import libxsmm_products, way
+from pacesetter.learner.precision import bfloat16_products
+from pacesetter.learner.products import by_library, way
 from pacesetter.networks import batch_renorm, mlp
 from pacesetter.training.trainer import Trainer
 
 KEY = jax.random.key(0)
 RNG = np.random.default_rng(0)
-CALL = "pacesetter_product"
-built = pytest.mark.skipif(products.library() is None, reason="libxsmm is not built in")
+CALL = products.LIBRARIES["libxsmm"].target
+built = pytest.mark.skipif(products.loaded("libxsmm") is None, reason="libxsmm is not built in")
+both_built = pytest.mark.parametrize(
+    "precision",
+    [
+        pytest.param(
+            library.precision,
+            marks=pytest.mark.skipif(not products.loaded(name), reason=f"{name} is not built in"),
+        )
+        for name, library in products.LIBRARIES.items()
+    ],
+)
+NAMES = {library.precision: name for name, library in products.LIBRARIES.items()}
 SHAPES = (
     (256, 256, 256),
     (64, 256, 23),
@@ -45,28 +57,36 @@ def _asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """As if nothing had been built."""
-    monkeypatch.setattr(products, "FILE", tmp_path / "absent.so")
-    products.library.cache_clear()
+    gone = {
+        name: library._replace(file=tmp_path / "absent.so")
+        for name, library in products.LIBRARIES.items()
+    }
+    monkeypatch.setattr(products, "LIBRARIES", gone)
+    products.loaded.cache_clear()
     yield
-    products.library.cache_clear()
+    products.loaded.cache_clear()
 
 
 def normal(*shape: int) -> Any:
     return jnp.asarray(RNG.standard_normal(shape), jnp.float32)
 
 
+def libxsmm_products(function: Any) -> Any:
+    return by_library(function, "f32")
+
+
 def calls(function: Any, *arguments: Any) -> int:
     """How many products of a function libxsmm makes."""
-    return calls_in(jax.make_jaxpr(libxsmm_products(function))(*arguments).jaxpr)
+    return calls_in(jax.make_jaxpr(libxsmm_products(function))(*arguments).jaxpr, CALL)
 
 
-def calls_in(program: Any) -> int:
+def calls_in(program: Any, target: str) -> int:
     """The same of a traced function, those in a loop counted once."""
     inner = [
         each.jaxpr for e in program.eqns for each in e.params.values() if hasattr(each, "jaxpr")
     ]
-    own = [e for e in program.eqns if e.params.get("target_name") == CALL]
-    return len(own) + sum(map(calls_in, inner))
+    own = [e for e in program.eqns if e.params.get("target_name") == target]
+    return len(own) + sum(calls_in(each, target) for each in inner)
 
 
 def update_of(name: str, precision: str) -> str:
@@ -152,19 +172,46 @@ def test_what_does_not_fit_stays_xlas() -> None:
     assert calls(several, normal(16, 16, 16)) == 0
 
 
-@built
-def test_results_repeat_bit_for_bit_whatever_the_threads() -> None:
-    """In this process again and again, and in another with one thread."""
-    program = """
+@both_built
+def test_in_bfloat16_a_product_and_its_gradients_are_numpys_of_rounded_operands(
+    precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For stacks, pairs and single matrices, whose rows two threads share where they are even."""
+    if precision != "bf16":
+        pytest.skip("in float32 the same is tested above")
+    monkeypatch.setenv(products.VARIABLE, "onednn")
+    target = products.LIBRARIES["onednn"].target
+    for stack, m, n, k in (((), 256, 256, 256), ((), 255, 130, 300), ((2,), 128, 64, 512)):
+        x, w, along = normal(*stack, m, k), normal(*stack, k, n), normal(*stack, m, n)
+        both = jax.value_and_grad(lambda x, w, a=along: jnp.vdot(x @ w, a), argnums=(0, 1))
+        low = by_library(bfloat16_products(both), "bf16")
+        assert calls_in(jax.make_jaxpr(low)(x, w).jaxpr, target) == 3
+        value, (to_x, to_w) = jax.jit(low)(x, w)
+        a, b, c = (np.asarray(each.astype(jnp.bfloat16), np.float64) for each in (x, w, along))
+        np.testing.assert_allclose(value, ((a @ b) * np.asarray(along)).sum(), rtol=1e-3)
+        assert_close(to_x, c @ b.swapaxes(-1, -2))
+        assert_close(to_w, a.swapaxes(-1, -2) @ c)
+
+
+@both_built
+def test_results_repeat_bit_for_bit_whatever_the_threads(precision: str) -> None:
+    """In this process again and again, and in others with other numbers of threads."""
+    program = f"""
 import hashlib, jax, jax.numpy as jnp
-from pacesetter.learner.products import libxsmm_products
+from pacesetter.learner.precision import bfloat16_products
+from pacesetter.learner.products import by_library
 x, w = (jnp.sin(jnp.arange(2 * 256 * 256.0).reshape(2, 256, 256) * f) for f in (1.0, 0.3))
-product = jax.jit(libxsmm_products(lambda x, w: (x @ w, x @ w.mT, x.mT @ w)))
-print({hashlib.sha256(b"".join(a.tobytes() for a in product(x, w))).hexdigest() for _ in range(50)})
+products = lambda x, w: (x @ w, x @ w.mT, x.mT @ w, x[0] @ w[0], x[0].T @ w[0])
+if "{precision}" == "bf16":
+    products = bfloat16_products(products)
+product = jax.jit(by_library(products, "{precision}"))
+hashed = lambda: hashlib.sha256(b"".join(a.tobytes() for a in product(x, w)))
+print({{hashed().hexdigest() for _ in range(50)}})
 """
     found: set[str] = set()
     for threads in ("1", "2", "5"):
-        words = ["env", f"NPROC={threads}", sys.executable, "-c", program]
+        asked = f"{products.VARIABLE}={NAMES[precision]}"
+        words = ["env", f"NPROC={threads}", asked, sys.executable, "-c", program]
         done = subprocess.run(words, capture_output=True, text=True, check=True)
         found.add(done.stdout)
     assert len(found) == 1
@@ -172,15 +219,14 @@ print({hashlib.sha256(b"".join(a.tobytes() for a in product(x, w))).hexdigest() 
 
 
 def test_who_makes_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    expected = "libxsmm" if products.library() else "xla"
-    assert way() == expected
-    assert way("bf16") == "xla"
-    for value in ("xla", ""):
+    made = {name: name if products.loaded(name) else "xla" for name in products.LIBRARIES}
+    assert (way(), way("bf16")) == (made["libxsmm"], "xla")
+    for value, low in (("xla", "xla"), ("", made["onednn"]), ("onednn", made["onednn"])):
         monkeypatch.setenv(products.VARIABLE, value)
-        assert way() == "xla"
+        assert (way(), way("bf16")) == ("xla", low)
         assert products.notes(None) == []
     monkeypatch.setenv(products.VARIABLE, "yes")
-    with pytest.raises(UsageError, match=rf"{products.VARIABLE}.*'yes'.*libxsmm, xla"):
+    with pytest.raises(UsageError, match=rf"{products.VARIABLE}.*'yes'.*libxsmm, onednn, xla"):
         way()
     monkeypatch.setenv(products.VARIABLE, "libxsmm")
     monkeypatch.setattr(products, "platform", lambda: "gpu")
@@ -188,37 +234,47 @@ def test_who_makes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     assert products.notes(None) == []
 
 
-@built
-@pytest.mark.parametrize("precision", ["f32", "bf16"])
-def test_an_update_calls_it_unless_in_bfloat16(precision: str) -> None:
-    text = update_of("td3", precision)
-    assert (CALL in text) == (precision == "f32")
-    assert ("bf16" in text) == (precision == "bf16")
+@both_built
+def test_an_update_calls_what_is_asked_for_in_its_precision_alone(
+    precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(products.VARIABLE, NAMES[precision])
+    for other in NAMES:
+        text, target = update_of("td3", other), products.LIBRARIES[NAMES[precision]].target
+        assert (target in text) == (other == precision)
+        assert ("bf16" in text) == (other == "bf16")
 
 
 @pytest.mark.usefixtures("absent")
-def test_without_the_library_xla_makes_them_and_a_line_says_so(runs: Path) -> None:
-    assert CALL not in update_of("td3", "f32")
-    trainer = Trainer("td3", "Hopper-v5", runs=runs, steps=20, eval_episodes=1)
+@pytest.mark.parametrize("precision", NAMES)
+def test_without_the_library_xla_makes_them_and_a_line_says_so(
+    precision: str, runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(products.VARIABLE, NAMES[precision])
+    assert "pacesetter_" not in update_of("td3", precision)
+    given: dict[str, Any] = {"steps": 20, "eval_episodes": 1, "precision": precision}
+    trainer = Trainer("td3", "Hopper-v5", runs=runs, **given)
     (note,) = trainer.notes
-    assert "libxsmm" in note
+    assert NAMES[precision] in note
     assert "\n" not in note
     assert trainer.directory.record()["products"] == "xla"
     list(trainer)
 
 
-@built
+@both_built
 def test_a_run_resumes_bit_for_bit_and_says_so_if_another_makes_them(
-    runs: Path, monkeypatch: pytest.MonkeyPatch
+    precision: str, runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv(products.VARIABLE, NAMES[precision])
     settings: dict[str, Any] = {
+        "precision": precision,
         "steps": 400, "warmup": 100, "hidden": (64, 64), "batch_size": 64, "eval_episodes": 1,
         "eval_every": 1_000, "checkpoint_every": 3600,
     }  # fmt: skip
     whole, stopped, other = (
         Trainer("td3", "HalfCheetah-v5", runs=runs, name=name, **settings) for name in "abc"
     )
-    assert whole.directory.record()["products"] == "libxsmm"
+    assert whole.directory.record()["products"] == NAMES[precision]
     stop_at(stopped, 217)
     stopped = Trainer.resume(stopped.directory.path)
     assert stopped.notes == []
@@ -228,7 +284,7 @@ def test_a_run_resumes_bit_for_bit_and_says_so_if_another_makes_them(
     monkeypatch.setenv(products.VARIABLE, "xla")
     other = Trainer.resume(other.directory.path)
     (note,) = other.notes
-    assert "products by libxsmm, going on with xla" in note
+    assert f"products by {NAMES[precision]}, going on with xla" in note
     assert other.directory.record()["resumed"][0]["products"] == "xla"
     run_to_end(other)
     actors = [jax.tree.leaves(trainer.loop.learners.states[0].actor) for trainer in (whole, other)]

@@ -70,9 +70,7 @@ class CompiledLearner:
         update = self._update_one
         if precision == "bf16":
             update = bfloat16_products(update)
-        elif products.way() == "libxsmm":
-            update = products.libxsmm_products(update)
-        self._update = jax.jit(update, donate_argnums=0)
+        self._update = jax.jit(products.by_library(update, precision), donate_argnums=0)
 
     def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""

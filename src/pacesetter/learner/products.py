@@ -1,14 +1,18 @@
-"""Float32 matrix products of a finished program by libxsmm, which XLA then calls, if asked for.
+"""Matrix products of a finished program by another library than XLA, which XLA then calls.
 
-`products.cc` is built when pacesetter is installed, where that is possible (hatch_build.py).
+libxsmm makes float32 products, if asked for; oneDNN those of `--precision bf16`, unless another is.
+`products.cc` and `bfloat16.cc` call them. They are built when pacesetter is installed, where that
+is possible (hatch_build.py).
 """
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable
-from functools import cache
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
@@ -21,55 +25,97 @@ from pacesetter.learner.rewriting import rewritten
 
 P = ParamSpec("P")
 R = TypeVar("R")
-Way = Literal["libxsmm", "xla"]
+Way = Literal["libxsmm", "onednn", "xla"]
 VARIABLE = "PACESETTER_PRODUCTS"
-FILE = Path(__file__).with_name("libproducts.so")
-TARGET = "pacesetter_product"
 LEAST = 16  # products with a side below it stay XLA's
-ABSENT = f"{VARIABLE}: libxsmm is not built in, so XLA makes all products; see docs/products.md"
+
+
+class Library(NamedTuple):
+    """Who makes products other than XLA."""
+
+    file: Path  # what calls it
+    precision: str  # of updates whose products it makes
+    operands: Any  # their type
+    target: str  # the name by which XLA calls it
+    needs: tuple[str, ...] = ()  # where its own file may be, first of all
+
+
+HERE = Path(__file__).parent
+LIBRARIES: dict[Way, Library] = {
+    "libxsmm": Library(HERE / "libproducts.so", "f32", jnp.float32, "pacesetter_product"),
+    "onednn": Library(
+        HERE / "libbfloat16.so",
+        "bf16",
+        jnp.bfloat16,
+        "pacesetter_bfloat16_product",
+        (f"{sys.prefix}/lib/libdnnl.so.3", "libdnnl.so.3"),  # of pip's package, or the system's
+    ),
+}
 
 
 def way(precision: str = "f32") -> Way:
-    """Who makes the float32 products of updates; it decides their last bits."""
-    return "libxsmm" if _wanted(precision) and library() else "xla"
+    """Who makes the products of updates in a precision; it decides their last bits."""
+    for name, library in LIBRARIES.items():
+        if library.precision == precision and _wanted(name) and loaded(name):
+            return name
+    return "xla"
 
 
 def of(hyper: Any) -> Way:
     """The same for a run's settings."""
-    return way(getattr(hyper, "precision", "f32"))
+    return way(_precision(hyper))
 
 
 def notes(hyper: Any) -> list[str]:
-    """What a person should know of it: a line if libxsmm is asked for and absent."""
-    wanted = _wanted(getattr(hyper, "precision", "f32"))
-    return [ABSENT] if wanted and not library() else []
+    """What a person should know of it: a line if a library is asked for by name and absent."""
+    return [
+        f"{VARIABLE}: {name} is not built in, so XLA makes all products; see docs/products.md"
+        for name, library in LIBRARIES.items()
+        if os.environ.get(VARIABLE) == name
+        and library.precision == _precision(hyper)
+        and _wanted(name)
+        and not loaded(name)
+    ]
 
 
-def _wanted(precision: str) -> bool:
-    value = os.environ.get(VARIABLE) or "xla"
+def _precision(hyper: Any) -> str:
+    return getattr(hyper, "precision", "f32")
+
+
+def _wanted(name: Way) -> bool:
+    """Whether a library is asked for; oneDNN is, unless another is."""
+    value = os.environ.get(VARIABLE) or "onednn"
     if value not in get_args(Way):
         raise unknown(VARIABLE, value, get_args(Way))
-    return value == "libxsmm" and precision == "f32" and platform() == "cpu"
+    return value == name and platform() == "cpu"
 
 
-def libxsmm_products(function: Callable[P, R]) -> Callable[P, R]:
-    """`function` whose float32 products of matrices, or of stacks of them, libxsmm makes."""
-    return rewritten(function, _by_libxsmm)
+def by_library(function: Callable[P, R], precision: str) -> Callable[P, R]:
+    """`function` whose products of matrices, or of stacks of them, are made as `way` says."""
+    made_by = way(precision)
+    return function if made_by == "xla" else rewritten(function, partial(_product_by, made_by))
 
 
 @cache
-def library() -> Any:
+def loaded(name: Way) -> Any:
     """The compiled products, made known to XLA; None where there are none that it can use."""
+    library = LIBRARIES[name]
+    for needed in library.needs:
+        with suppress(OSError):
+            ctypes.CDLL(needed, mode=ctypes.RTLD_GLOBAL)
+            break
     try:
-        found = ctypes.CDLL(str(FILE))
+        found = ctypes.CDLL(str(library.file))
         found.fits.restype = ctypes.c_bool
-        jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(found.product), platform="cpu")
+        jax.ffi.register_ffi_target(
+            library.target, jax.ffi.pycapsule(found.product), platform="cpu"
+        )
     except (OSError, AttributeError, jax.errors.JaxRuntimeError):
         return None
     return found
 
 
-def _by_libxsmm(equation: JaxprEqn, inputs: list[Any]) -> Any:
+def _product_by(made_by: Way, equation: JaxprEqn, inputs: list[Any]) -> Any:
     if equation.primitive is not dot_general_p:
         return None
     left, right = inputs
@@ -80,21 +126,24 @@ def _by_libxsmm(equation: JaxprEqn, inputs: list[Any]) -> Any:
         return None
     left_t, right_t = left_sum[0] == len(shared), right_sum[0] == len(shared) + 1
     if not left_t:
-        return _product(left, right, right_t=right_t)
+        return _product(made_by, left, right, right_t=right_t)
     if right_t:
         return None
     # A gradient of weights, which JAX makes transposed and then turns: the two turns cancel.
-    found = _product(right, left, left_t=True)
+    found = _product(made_by, right, left, left_t=True)
     return None if found is None else jnp.swapaxes(found, -1, -2)
 
 
-def _product(left: Any, right: Any, *, left_t: bool = False, right_t: bool = False) -> Any:
+def _product(
+    made_by: Way, left: Any, right: Any, *, left_t: bool = False, right_t: bool = False
+) -> Any:
     """(..., m, k) times (..., k, n), each as it is or stored transposed; None if it is XLA's."""
+    library = LIBRARIES[made_by]
     m, k = left.shape[-2:][:: -1 if left_t else 1]
     n = right.shape[-2 if right_t else -1]
-    if left.dtype != jnp.float32 or right.dtype != jnp.float32 or not left.size:
+    if left.dtype != library.operands or right.dtype != library.operands or not left.size:
         return None
-    if min(m, n, k) < LEAST or not library().fits(m, n, k, left_t, right_t):
+    if min(m, n, k) < LEAST or not loaded(made_by).fits(m, n, k, left_t, right_t):
         return None
     shape = jax.ShapeDtypeStruct((*left.shape[:-2], m, n), jnp.float32)
-    return jax.ffi.ffi_call(TARGET, shape)(left, right, left_t=left_t, right_t=right_t)
+    return jax.ffi.ffi_call(library.target, shape)(left, right, left_t=left_t, right_t=right_t)
