@@ -1,7 +1,7 @@
 """Whether another library makes an update's matrix products quicker than XLA does.
 
     python benchmarks/products.py
-    python benchmarks/products.py --updates     whole updates, in each way that pacesetter can make them
+    python benchmarks/products.py --updates     whole updates, in each way of pacesetter
 
 The products are read out of the updates themselves. Each is timed alone, a few independent ones a
 call, and the best of many short repeats counts; the libraries take turns. XLA may take the sides of
