@@ -28,7 +28,7 @@ from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.study.bench import queue as bench_module
 from pacesetter.study.bench import suite
-from pacesetter.study.bench.executors import Local
+from pacesetter.study.bench.executors import Local, run_command
 from pacesetter.study.bench.queue import RETRIES, Bench, Outcome, is_finished
 from pacesetter.study.bench.suite import Job, expand, load
 from pacesetter.training.trainer import Trainer
@@ -912,3 +912,34 @@ def test_arms_of_the_ensemble_suite_spend_what_it_says() -> None:
         times = 2 if run.name == "single-200k" else 1
         assert (steps, updates) == (times * 100_000, times * 95_000), run.name
         assert (run.members, run.wait) in {(1, True), (2, False)}
+
+
+LEAVES = """#!/bin/sh
+sleep 600 &
+echo $!
+"""
+
+
+@pytest.mark.parametrize("where", ["local", "ray"])
+def test_what_a_crashed_run_leaves_running_is_ended(
+    where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = tmp_path / "python"
+    program.write_text(LEAVES)
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    if where == "ray":
+        before = signal.getsignal(signal.SIGINT)
+        outcome = Outcome(*run_command(["train"], str(tmp_path)))
+        signal.signal(signal.SIGINT, before)
+    else:
+        executor = Local(1)
+        task = executor.start(0, ["train"])
+        while (found := executor.poll(task)) is None:
+            time.sleep(0.01)
+        outcome = found
+    end = time.monotonic() + 5
+    while Path(f"/proc/{int(outcome.output)}").exists():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert outcome.code == 0

@@ -46,6 +46,7 @@ class Tally:
     largest: float = 0.0  # megabytes that one attempt added to this process's peak
     megabytes: float = 0.0  # megabytes that all together added to it
     wrong: list[str] = field(default_factory=list[str])
+    values: dict[str, float] = field(default_factory=dict[str, float])  # what else was measured
     before: int = field(default_factory=lambda: _peak())
 
     @property

@@ -24,10 +24,13 @@ import crowds  # noqa: E402
 import disk_full  # noqa: E402
 import exactness  # noqa: E402
 import faults  # noqa: E402
+import memory  # noqa: E402
 import odd_files  # noqa: E402
 import page  # noqa: E402
 import power_cuts  # noqa: E402
 import processes  # noqa: E402
+import rude  # noqa: E402
+import sameness  # noqa: E402
 import swapped  # noqa: E402
 from attempts import Tally  # noqa: E402
 
@@ -88,6 +91,33 @@ EXPERIMENTS = (
         12,
         200,
         Tally.of_processes,
+    ),
+    Experiment(
+        "rude",
+        "tasks that raise, exit, crash, hang or print, in Python or C, in `train` and in `bench`",
+        "no orphan, no false success; one line unless killed; a run beside it ends well",
+        rude.run,
+        6,
+        26,
+        rude.told,
+    ),
+    Experiment(
+        "one-seed",
+        "one seed under a random load, and on other numbers of threads, new or resumed",
+        "the same run, bit for bit; where threads change bits, config.json or a line says so",
+        sameness.run,
+        6,
+        24,
+        sameness.told,
+    ),
+    Experiment(
+        "memory",
+        "thousands of steps after the replay is full; many trainings in one process",
+        "under 1 MB more in 100,000 steps; within 5% of the memory after the first trainings",
+        memory.run,
+        20,
+        200,
+        memory.told,
     ),
     Experiment(
         "faults",

@@ -8,11 +8,14 @@ import crowds
 import disk_full
 import exactness
 import faults
+import memory
 import odd_files
 import page
 import power_cuts
 import processes
 import pytest
+import rude
+import sameness
 import swapped
 from attempts import Tally, attempt, command
 
@@ -66,6 +69,25 @@ def test_a_full_disk(tmp_path: Path) -> None:
 def test_what_was_not_synced_is_lost(tmp_path: Path) -> None:
     tally = power_cuts.run(tmp_path, 8, seed=5)
     assert (tally.made, tally.wrong) == (8, [])
+
+
+@pytest.mark.parametrize("way", ["ExitsInC", "Prints"])
+def test_a_rude_task(way: str, tmp_path: Path) -> None:
+    assert rude.Trial(way, "train", tmp_path / "0", 200).fault() == ""
+
+
+def test_one_seed_is_one_run(tmp_path: Path) -> None:
+    tally = sameness.run(tmp_path, 1, seed=5)
+    assert (tally.made, tally.wrong) == (1, [])
+
+
+def test_a_leak_is_seen(tmp_path: Path) -> None:
+    """And a few trainings give back what they took."""
+    tally = memory.run(tmp_path, 3, leak=3_000)
+    (leak,) = tally.wrong
+    assert "MB more in 100,000 steps" in leak
+    assert 200 < tally.values["slope"] < 400
+    assert tally.values["trainings"] == 5
 
 
 def test_disturbed_and_exact(tmp_path: Path) -> None:

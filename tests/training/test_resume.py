@@ -1,6 +1,9 @@
 """A run that is stopped and resumed equals the run that never stopped, bit for bit."""
 
+import gc
+import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,3 +173,20 @@ def test_checkpoint_of_an_earlier_version_is_refused_in_one_line(runs: Path) -> 
         Trainer.resume(directory.path)
     assert directory.state_file.read_bytes() == before
     assert not directory.in_use()
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "trpo"])
+def test_a_trainer_that_is_dropped_takes_its_programs_along(algorithm: str, runs: Path) -> None:
+    """At once: those of several trainings would else fill the memory of one process."""
+    sizes: dict[str, Any] = {"rollout_length": 50} if algorithm == "trpo" else dict(TINY)
+    trainer = Trainer(
+        algorithm, "Pendulum-v1", runs=runs, **{**sizes, "steps": 900, "hidden": (8,)}
+    )
+    run_to_end(trainer)
+    compiled = weakref.ref(trainer.loop.learners.compiled)
+    gc.disable()
+    try:
+        del trainer
+        assert compiled() is None
+    finally:
+        gc.enable()

@@ -8,7 +8,7 @@ waiting member shifts nobody's stream and no state ever holds a key.
 
 from collections.abc import Sequence
 from enum import IntEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -65,9 +65,9 @@ class CompiledLearner:
         self._ema_actors = jax.jit(
             lambda ema, state, tau: incremental_update(learner.policy(state).layers, ema, tau)
         )
-        self._fold = jax.jit(self._fold_keys)
-        self._keys = lru_cache(maxsize=1024)(self._make_keys)
-        update = self._update_one
+        self._keys = lru_cache(maxsize=1024)(partial(_keys_of, jax.jit(_fold_keys), self.key))
+        self._program = _Program(learner, layout, normalize, jax.random.key_impl(self.key))
+        update = self._program.update
         if precision == "bf16":
             update = bfloat16_products(update)
         self._update = jax.jit(products.by_library(update, precision), donate_argnums=0)
@@ -108,7 +108,7 @@ class CompiledLearner:
         rows, weight, statistics, extra, *_ = *inputs, None
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
-            batch = self._batch(rows, weight, statistics, extra)
+            batch = self._program.batch(rows, weight, statistics, extra)
             return self.learner.update(state, batch, self.key).losses
 
         return sorted(jax.eval_shape(losses, state, rows, extra or {}))
@@ -131,18 +131,19 @@ class CompiledLearner:
             shapes=(env.observation_shape, env.action_shape),
         )  # fmt: skip
 
-    def _make_keys(self, member: int, block: int) -> Any:
-        first = np.uint32(block * KEYS)
-        return np.asarray(self._fold(self.key, first, member))
 
-    # Below: what is compiled. `key` is an argument so that the program is the same for every seed.
+class _Program(NamedTuple):
+    """What is compiled: a pure function of its arguments, the same for every seed.
 
-    def _fold_keys(self, key: Array, first: Any, member: Any) -> Array:
-        calls = first + jnp.arange(KEYS, dtype=jnp.uint32)
-        keys = jax.vmap(lambda call: _key(key, KeyUse.UPDATE, call, member))(calls)
-        return jax.random.key_data(keys)
+    It knows nothing of who compiles it: a circle would keep programs, which are large, in memory.
+    """
 
-    def _update_one(
+    learner: Learner
+    layout: Layout
+    normalize: bool
+    impl: Any  # of the random keys
+
+    def update(
         self,
         state: State,
         rows: Array,
@@ -152,8 +153,9 @@ class CompiledLearner:
         scales: dict[str, Array],
         key: Array,
     ) -> tuple[State, Array, Array, Any]:
-        batch = self._batch(rows, weight, statistics, extra)
-        whole = jax.random.wrap_key_data(key, impl=jax.random.key_impl(self.key))
+        """A member's state after one call, its losses, its TD errors, and what it acts with."""
+        batch = self.batch(rows, weight, statistics, extra)
+        whole = jax.random.wrap_key_data(key, impl=self.impl)
         learner = scaled(self.learner, scales) if scales else self.learner
         if "gamma" in scales:  # rows hold the discount of the run's own gamma
             share = learner.hyper.gamma / self.learner.hyper.gamma
@@ -164,7 +166,8 @@ class CompiledLearner:
         params = jax.tree.map(jnp.copy, self.learner.policy_params(update.state))
         return update.state, losses, update.td_error, params
 
-    def _batch(self, rows: Any, weight: Any, statistics: Any, extra: dict[str, Any]) -> Any:
+    def batch(self, rows: Any, weight: Any, statistics: Any, extra: dict[str, Any]) -> Any:
+        """Rows (U, B, width) as a batch that the learner takes."""
         batch = self.layout.unpack(rows)
         batch = batch._replace(
             weight=jnp.ones(rows.shape[:-1]) if weight is None else weight,
@@ -181,6 +184,16 @@ class CompiledLearner:
             return observation
         mean, deviation = statistics
         return jnp.clip((observation - mean) / deviation, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+
+def _keys_of(fold: Any, key: Array, member: int, block: int) -> Any:
+    return np.asarray(fold(key, np.uint32(block * KEYS), member))
+
+
+def _fold_keys(key: Array, first: Any, member: Any) -> Array:
+    calls = first + jnp.arange(KEYS, dtype=jnp.uint32)
+    keys = jax.vmap(lambda call: _key(key, KeyUse.UPDATE, call, member))(calls)
+    return jax.random.key_data(keys)
 
 
 def of_transitions(learner: Learner, seed: int) -> CompiledLearner:

@@ -34,6 +34,7 @@ class Local:
         process, output = task
         if process.poll() is None:
             return None
+        _end(process)
         output.seek(0)
         with output:
             return Outcome(process.returncode, output.read().decode(errors="replace"))
@@ -42,8 +43,7 @@ class Local:
         task[0].terminate()
 
     def kill(self, task: Any) -> None:
-        with suppress(ProcessLookupError):
-            os.killpg(task[0].pid, signal.SIGKILL)
+        _end(task[0])
 
 
 class Ray:
@@ -98,6 +98,7 @@ def run_command(words: list[str], folder: str) -> tuple[int, str]:
         except KeyboardInterrupt:
             process.terminate()
             process.wait()
+        _end(process)
         output.seek(0)
         return process.returncode, output.read().decode(errors="replace")
 
@@ -112,6 +113,12 @@ def _popen(words: list[str], output: Any, folder: str | None = None) -> subproce
         cwd=folder,
         start_new_session=True,  # Ctrl-C reaches the bench alone, which passes it on once
     )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a command, if it runs, and all that it started: a crash leaves a simulator's helpers."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 @contextmanager
