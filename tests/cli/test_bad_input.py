@@ -148,6 +148,14 @@ BAD_COMMANDS: dict[str, tuple[list[str], list[str]]] = {
         ["train", "td3", "dm_control/cheetah-run-v0"],
         ["pip install 'shimmy[dm-control]' 'mujoco<4'", "shimmy:dm_control/cheetah-run-v0"],
     ),
+    "module of a known package": (
+        ["train", "td3", "gymnasium_robotics:FetchReach-v4"],
+        ["No module named", "`pip install gymnasium-robotics`"],
+    ),
+    "module that is not there": (
+        ["train", "td3", "no_such_module:Task-v0"],
+        ["no_such_module", "current one or in PYTHONPATH"],
+    ),
     "versions in a module": (
         ["train", "td3", "odd_envs:OddInfo"],
         ["has no version", "write odd_envs:OddInfo-v0"],

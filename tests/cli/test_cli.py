@@ -488,11 +488,17 @@ def test_more_steps_equal_a_larger_budget(command: Command) -> None:
 
 
 @pytest.mark.parametrize("steps", [150, 200])
-def test_resume_of_a_finished_run_changes_nothing(steps: int, command: Command) -> None:
-    """In the middle of an episode and at its end."""
+def test_resume_of_a_finished_run_changes_nothing(
+    steps: int, command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the middle of an episode and at its end; a line says so, and what to give."""
     directory = trained(command, "td3", "--steps", steps)
     before = RunDirectory(Path(shutil.copytree(directory.path, "before")))
-    assert f"{steps} steps" in command("resume", directory.path, "-q")
+    capsys.readouterr()
+    assert main(["resume", str(directory.path), "-q"]) == 0
+    out, err = capsys.readouterr()
+    assert f"{steps} steps" in out
+    assert err.startswith("pacesetter: budget: nothing is left to do; give more --steps")
     assert_same(directory, before)
 
 

@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from pacesetter.training.trainer import Trainer
 
 
+SPENT = (
+    "budget: nothing is left to do; give more --steps, or the --time, --stop-at or --stop-patience "
+    "that ended it anew"
+)
+
+
 class Command(NamedTuple):
     """A run to train, and the command's own flags: no progress, and trackers of the log."""
 
@@ -129,7 +135,7 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     with stopping(lambda: [each.stop() for each in trainers]) as received:
         trainer, quiet, log = begin(words)
         trainers.append(trainer)
-        for note in trainer.notes:
+        for note in (*trainer.notes, *([SPENT] if trainer.finished else ())):
             print(f"pacesetter: {note}", file=sys.stderr)
         if received:
             trainer.stop()

@@ -45,8 +45,20 @@ def refuse_unknown(name: str) -> None:
     for pattern, module, packages in PACKAGES:
         if re.match(pattern, name):
             raise UsageError(
-                f"env: '{name}' is a task of another package; "
-                f"`pip install {shlex.join(packages.split())}` and write {module}:{name}"
+                f"env: '{name}' is a task of another package; {_install(packages)} and write "
+                f"{module}:{name}"
             )
     refusal = unknown("env", name, known(), see="pacesetter list envs")
     raise UsageError(f"{refusal}; a task of another package is written module:Id-v0")
+
+
+def where_to_find(name: str) -> str:
+    """What to do about an id whose module is not there: install it, if it is a known one."""
+    for _, module, packages in PACKAGES:
+        if name.startswith(f"{module}:"):
+            return _install(packages)
+    return "its folder must be the current one or in PYTHONPATH"
+
+
+def _install(packages: str) -> str:
+    return f"`pip install {shlex.join(packages.split())}`"

@@ -11,7 +11,7 @@ from functools import reduce
 import gymnasium
 
 from pacesetter.envs.calls import call
-from pacesetter.envs.ids import full_id, refuse_unknown
+from pacesetter.envs.ids import full_id, refuse_unknown, where_to_find
 from pacesetter.envs.spaces import check_spaces
 from pacesetter.envs.wrappers import Env, flattened, wrapped
 from pacesetter.errors import TaskError, UsageError
@@ -19,7 +19,6 @@ from pacesetter.settings import Settings
 
 Factory = Callable[..., Env]
 FUNCTION = "function/"  # begins the name of a task that a function makes
-FIND = "; its folder must be the current one or in PYTHONPATH"
 
 
 def _log_warning(message: str) -> None:
@@ -88,8 +87,8 @@ class Recipe:
             failed = f"env: cannot make '{name}'"
             env = call(failed, self.timeout, make_quietly, name, self.kwargs)
         except TaskError as error:
-            hint = FIND if isinstance(error.__cause__, ModuleNotFoundError) and ":" in name else ""
-            raise UsageError(f"{error}{hint}") from None
+            missing = isinstance(error.__cause__, ModuleNotFoundError) and ":" in name
+            raise UsageError(f"{error}; {where_to_find(name)}" if missing else str(error)) from None
         module, colon, asked = name.partition(":")
         made = env.spec.id if env.spec else asked
         if colon and made != asked:
