@@ -327,6 +327,16 @@ def worker(*words: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.slow
+def test_trials_of_a_study_that_is_gone_are_not_taken_up(here: Path) -> None:
+    """They have other settings, which a new study would train on with."""
+    study(trials=1).run(silent)
+    (here / "study.log").unlink()
+    with pytest.raises(UsageError, match=r"^study: study.log is gone, but study.log.runs has"):
+        study(trials=1, steps=300)
+    assert not (here / "study.log").exists()
+    study(trials=1, steps=300, file="other.log").run(silent)
+
+
 def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     """All trials are made, each once; the survivor takes up what the other left."""
     words = ("--trials", "4", "--steps", "1500", "--warmup", "1M", "--study", "s.log")

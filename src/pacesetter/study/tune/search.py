@@ -17,7 +17,7 @@ import numpy as np
 from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
-from pacesetter.runs import Row, RunDirectory
+from pacesetter.runs import Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
 from pacesetter.storage import make_folder, present, sync_folder, write_atomically
@@ -50,9 +50,9 @@ class Tuning:
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
         self.config, self.file = resolve(algorithm, env, fixed), Path(file)
         self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
+        self.runs = self.file.parent / f"{self.file.name}.runs"
         self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
-        self.runs = self.file.with_name(f"{self.file.name}.runs")
         self._lock, journal = Lock(self.runs / "lock"), Lock(self.runs / "journal.lock")
         self._trainer: Trainer | None = None
         self._stopping = False
@@ -80,6 +80,11 @@ class Tuning:
         if not self.file.name or self.file.is_dir():
             raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
         refuse_foreign(self.file)
+        if not self.file.exists() and any(find_all(self.runs)):
+            raise UsageError(
+                f"study: {self.file} is gone, but {self.runs} has its trials; move them away, or "
+                "give another --study"
+            )
         self.config.recipe.make().close()
 
     def stop(self) -> None:
