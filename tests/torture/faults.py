@@ -119,8 +119,8 @@ SITES = {
     "reward": (_reward, "reward: must be"),
     "action": (_action, "action: must be"),
     "loss": (_loss, r"\w+ is "),
-    "weight": (_weight, r"[\w.]+ (is|holds|must be) "),
-    "moment": (_moment, r"[\w.]+ (is|holds|must be) "),
+    "weight": (_weight, r"[\w.]+:? (is|holds|must be) "),
+    "moment": (_moment, r"[\w.]+:? (is|holds|must be) "),
 }
 
 
