@@ -498,7 +498,7 @@ def test_resume_of_a_finished_run_changes_nothing(
     assert main(["resume", str(directory.path), "-q"]) == 0
     out, err = capsys.readouterr()
     assert f"{steps} steps" in out
-    assert err.startswith("pacesetter: budget: nothing is left to do; give more --steps")
+    assert err.startswith("pacesetter: budget: nothing is left to do; to go on, give more --steps")
     assert_same(directory, before)
 
 

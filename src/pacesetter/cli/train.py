@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 SPENT = (
-    "budget: nothing is left to do; give more --steps, or the --time, --stop-at or --stop-patience "
-    "that ended it anew"
+    "budget: nothing is left to do; to go on, give more --steps, or a new --time, --stop-at or "
+    "--stop-patience"
 )
 
 
