@@ -98,7 +98,7 @@ def _resumed_trainer(words: list[str]) -> Command:
     add("--stop-at", type=float, metavar="RETURN", help="new mean return to stop at")
     patience = "new number of evaluations without a best one, after which to stop"
     add("--stop-patience", type=int, metavar="N", help=patience)
-    limit = "new longest time of a task's step or reset, such as 30s"
+    limit = "new limit of a task's step, reset or making, such as 30s"
     add("--env-timeout", metavar="T", help=limit)
     add("--checkpoint-every", metavar="T", help="new time between checkpoints, such as 5m")
     command.add_allow()

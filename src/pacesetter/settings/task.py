@@ -72,8 +72,7 @@ class Task:
     env_timeout: Duration | None = Field(
         None,
         gt=0,
-        description="end a run whose task takes longer for a step or reset, such as 30s; "
-        "default no limit",
+        description="end a run whose task takes longer for any call, such as 30s; default no limit",
     )
     wrap: tuple[str, ...] = Field(
         (), description="put wrappers around the task, the innermost first; may be repeated"

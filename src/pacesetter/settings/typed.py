@@ -34,7 +34,7 @@ class RunSettings(TypedDict, total=False):
     seed: int
     """seed of every random stream"""
     env_timeout: float | str | None
-    """end a run whose task takes longer for a step or reset, such as 30s; default no limit"""
+    """end a run whose task takes longer for any call, such as 30s; default no limit"""
     wrap: Sequence[str]
     """put wrappers around the task, the innermost first; may be repeated"""
     renew_env: bool | None
