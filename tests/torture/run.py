@@ -173,15 +173,20 @@ def main() -> int:
     names = [each.name for each in EXPERIMENTS]
     command.add_argument("names", nargs="*", metavar="NAME", help=f"one of {', '.join(names)}")
     command.add_argument("--long", action="store_true", help="the sizes of the targets")
+    size = "another size, of the one experiment that is named"
+    command.add_argument("--size", type=int, metavar="N", help=size)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
     jobs = "experiments at once (default one per core)"
     command.add_argument("--jobs", type=int, default=cores, metavar="N", help=jobs)
     given = command.parse_args()
     if unknown := {*given.names} - {*names}:
         command.error(f"no experiment has the name {min(unknown)}")
+    if given.size is not None and (len(given.names) != 1 or given.size < 1):
+        command.error("--size must be at least 1, and goes with one NAME")
     if len(given.names) == 1:
         (each,) = (each for each in EXPERIMENTS if each.name in given.names)
-        return 0 if _run(each, each.long if given.long else each.short) else 1
+        count = given.size or (each.long if given.long else each.short)
+        return 0 if _run(each, count) else 1
     with ThreadPoolExecutor(given.jobs) as pool:
         codes = [*pool.map(partial(_in_its_own, long=given.long), given.names or names)]
     return 1 if any(codes) else 0
