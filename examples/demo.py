@@ -1,4 +1,4 @@
-"""Train two members for five minutes, or go on with them; print a table, draw a curve and a film.
+"""Train a walker for five minutes, or go on with it; print a table, draw a curve and a film.
 
 All is written below the working directory: runs/, demo.png and demo.mp4.
 """
@@ -18,7 +18,7 @@ from pacesetter.policy import Policy
 from pacesetter.process import stopping
 from pacesetter.runs import RunDirectory
 
-ALGORITHM, ENV, RUNS = "demo", "HalfCheetah-v5", Path("runs")
+ALGORITHM, ENV, RUNS = "quick", "HalfCheetah-v5", Path("runs")
 RUN = RUNS / ENV / ALGORITHM / "0"
 EPISODES, SEED = 10, 1
 
@@ -49,7 +49,7 @@ def open_run() -> Trainer:
     """A new run, or the one that an earlier call began."""
     if not RunDirectory(RUN).config_file.exists():
         say(f"training into {RUN} for at most 5 minutes; Ctrl-C saves, and a new call goes on")
-        return Trainer(ALGORITHM, ENV, runs=RUNS, steps=100_000, time="5m")
+        return Trainer(ALGORITHM, ENV, runs=RUNS, steps=150_000, time="5m")
     trainer = Trainer.resume(RUN, runs=RUNS)
     for note in trainer.notes:
         say(note)

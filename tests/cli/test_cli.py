@@ -128,7 +128,7 @@ DEFAULTS = {
     ("ddpg-original", "HalfCheetah-v5"): {"warmup": "10000", "exploration": "ou"},
     ("crossq", "Ant-v5"): {"critic-hidden": "2048 2048", "exploration": "policy"},
     ("crossq-small", "Ant-v5"): {"critic-hidden": "256 256", "hidden": "256 256"},
-    ("demo", "HalfCheetah-v5"): {"members": "2", "critic-layer-norm": "on"},
+    ("quick", "HalfCheetah-v5"): {"critic-hidden": "256 256", "precision": "bf16"},
 }
 
 
@@ -176,7 +176,7 @@ LISTS = {
     "algorithms": ["td3", "ddpg", "multi-td3", "multi-ddpg"],
     "envs": ["HalfCheetah-v5", "Ant-v4", "Humanoid-v5", "pacesetter/Ant111-v4", "module:Id"],
     "rules": ["none", "best", "random", "top_half", "tournament"],
-    "presets": ["td3-paper", "ddpg-original", "demo", "Fujimoto", "Lillicrap"],
+    "presets": ["td3-paper", "ddpg-original", "quick", "Fujimoto", "Lillicrap"],
     "suites": ["smoke", "pilot", "published", "paper-table-1", "paper-table-2"],
     "runs": ["no runs below runs"],
 }
@@ -448,7 +448,7 @@ def test_every_preset_builds(name: str) -> None:
     assert state.actor[0]["kernel"].shape[-2:] == (17, hyper.hidden[0])
     outputs = 12 if run.algorithm in ("sac", "crossq", "sunrise") else 6  # means and log deviations
     assert state.actor[-1]["kernel"].shape[-2:] == (hyper.hidden[-1], outputs)
-    assert run.members == (2 if "multi-" in name or name == "demo" else 1)
+    assert run.members == (2 if "multi-" in name else 1)
     table = config.presets()[name.removeprefix("multi-")]
     assert table["help"]
     assert table["source"]

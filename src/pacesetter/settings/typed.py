@@ -8,8 +8,8 @@ Name = Literal[
     "td3", "td7", "sac", "tqc", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3", "ddpg",
     "trpo", "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-tqc", "multi-crossq",
     "multi-sunrise", "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg",
-    "td3-paper", "ddpg-original", "crossq-small", "crossq-lean", "crossq-bins", "crossq-wn",
-    "td7-small", "sunrise-official", "demo", "steve-paper", "me-trpo-paper"
+    "td3-paper", "ddpg-original", "crossq-small", "quick", "crossq-lean", "crossq-bins",
+    "crossq-wn", "td7-small", "sunrise-official", "steve-paper", "me-trpo-paper"
 ]
 # fmt: on
 
