@@ -59,13 +59,15 @@ def run(folder: Path, count: int, seed: int = 0, points: int = POINTS) -> Tally:
         except (AssertionError, subprocess.TimeoutExpired) as error:
             tally.wrong.append(f"{name} on {task}: {error!s:.300}")
         tally.made += points
+        tally.values["pairs"] = number + 1
         jax.clear_caches()
     return tally
 
 
 def told(tally: Tally) -> str:
     """As the table tells it."""
-    return f"{tally.made:,} points, {len(tally.wrong)} runs that differ or fail"
+    pairs = f"{tally.values['pairs']} of {len(listed()) * len(TASKS)} pairs of algorithm and task"
+    return f"{tally.made:,} points in {pairs}; {len(tally.wrong)} that differ or fail"
 
 
 def _words(name: str, task: str) -> list[str]:

@@ -60,7 +60,7 @@ def told(tally: Tally) -> str:
     lies = sum("claims" in each for each in tally.wrong)
     others = len(tally.wrong) - orphans - lies
     return (
-        f"{tally.made} made in {len(EVERY)} ways; {orphans} orphans, {lies} false successes, "
+        f"{tally.made} made, of {2 * len(EVERY)} kinds; {orphans} orphans, {lies} false successes, "
         f"{others} other faults"
     )
 
