@@ -151,8 +151,8 @@ EXPERIMENTS = (
         "stopped, killed and resumed at 10 random points of a run: all algorithms, four tasks",
         "weights, replay, streams and log as those of the run that nobody disturbed, bit for bit",
         exactness.run,
-        20,
-        80,
+        22,
+        88,
         exactness.told,
     ),
     Experiment(
