@@ -30,4 +30,4 @@ def test_a_run_ends_by_its_steps_or_its_time(
     step: int, seconds: float, time: float | None, spent: bool
 ) -> None:
     settings = {"members": 1, "count": "all", "steps": 900, "time": time}
-    assert budget.is_spent(settings, step, seconds, best=None) is spent
+    assert budget.is_spent(settings, step, seconds, budget.Standing()) is spent

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pacesetter import storage
+from pacesetter import files, storage
 from pacesetter.errors import UsageError
 from pacesetter.storage import Content
 
@@ -136,19 +136,19 @@ def test_without_second_names_two_writes_are_kept_too(
         storage.write(file, "thing", Content({}, {"n": n}), keep)
     assert storage.read(file, "thing").table == {"n": 2}
     assert storage.read(keep, "thing").table == {"n": 1}
-    storage.link(keep, file)
+    files.link(keep, file)
     assert storage.read(file, "thing").table == {"n": 1}
 
 
 def test_a_new_folder_has_its_name_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda file: synced.append(os.fstat(file).st_ino))
-    assert storage.make_folder(tmp_path / "new")
+    assert files.make_folder(tmp_path / "new")
     assert synced == [tmp_path.stat().st_ino]
-    assert not storage.make_folder(tmp_path / "new")
+    assert not files.make_folder(tmp_path / "new")
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError):
-        storage.make_folder(tmp_path / "file")
+        files.make_folder(tmp_path / "file")
 
 
 @pytest.mark.parametrize(("answer", "whole"), [(errno.EINVAL, True), (errno.EIO, False)])
@@ -165,10 +165,10 @@ def test_a_folder_that_cannot_be_synced(
 
     monkeypatch.setattr(os, "fsync", of_files_only)
     if whole:
-        storage.write_atomically(tmp_path / "file", b"1")
+        files.write_atomically(tmp_path / "file", b"1")
     else:
         with pytest.raises(OSError, match=os.strerror(answer)):
-            storage.write_atomically(tmp_path / "file", b"1")
+            files.write_atomically(tmp_path / "file", b"1")
     assert (tmp_path / "file").read_bytes() == b"1"
 
 
@@ -188,7 +188,7 @@ def test_space_is_reserved_where_the_system_cannot(
         monkeypatch.setattr(os, "posix_fallocate", refuse)
     (tmp_path / "file").write_bytes(b"rows")
     with (tmp_path / "file").open("r+b") as file:
-        storage.reserve(file.fileno(), 3_000_001)
+        files.reserve(file.fileno(), 3_000_001)
     assert (tmp_path / "file").read_bytes() == b"rows" + bytes(2_999_997)
     assert (tmp_path / "file").stat().st_blocks * 512 >= 3_000_001
 
@@ -199,7 +199,7 @@ def test_a_full_disk_reserves_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(os, "posix_fallocate", refuse)
     with (tmp_path / "file").open("w+b") as file, pytest.raises(OSError, match="No space"):
-        storage.reserve(file.fileno(), 100)
+        files.reserve(file.fileno(), 100)
 
 
 def link_to_a_file(path: Path) -> None:
@@ -222,7 +222,7 @@ def test_what_is_no_file_is_not_opened(kind: str, mode: str, tmp_path: Path) -> 
     """Nor followed, nor waited for."""
     ODD[kind](tmp_path / "file")
     with pytest.raises(OSError, match="is not a regular file"):
-        open(tmp_path / "file", mode, opener=storage.regular)  # noqa: SIM115
+        open(tmp_path / "file", mode, opener=files.regular)  # noqa: SIM115
     with pytest.raises(UsageError, match="file: cannot be read: is not a regular file"):
         storage.read(tmp_path / "file", "thing")
     if kind == "link":
@@ -232,9 +232,9 @@ def test_what_is_no_file_is_not_opened(kind: str, mode: str, tmp_path: Path) -> 
 def test_a_link_is_replaced_not_written_through(tmp_path: Path) -> None:
     """Also where the temporary file would lie."""
     link_to_a_file(tmp_path / "file")
-    (tmp_path / f"file{storage.TEMPORARY}").symlink_to("other")
-    storage.write_atomically(tmp_path / "file", b"own", tmp_path / "before")
-    assert storage.read_bytes(tmp_path / "file") == b"own"
+    (tmp_path / f"file{files.TEMPORARY}").symlink_to("other")
+    files.write_atomically(tmp_path / "file", b"own", tmp_path / "before")
+    assert files.read_bytes(tmp_path / "file") == b"own"
     assert (tmp_path / "other").read_bytes() == b"another's"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other"]
 
@@ -247,7 +247,7 @@ def test_a_write_that_fails_leaves_no_litter(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        storage.write_atomically(tmp_path / "file", b"1")
+        files.write_atomically(tmp_path / "file", b"1")
     assert not [*tmp_path.iterdir()]
 
 
@@ -266,8 +266,8 @@ def test_a_file_that_another_library_writes_is_replaced_whole(
     file = tmp_path / "film.mp4"
     if before is not None:
         file.write_bytes(before)
-    (tmp_path / f"film{storage.TEMPORARY}.mp4").symlink_to(tmp_path / "elsewhere")
-    with suppress(OSError, KeyboardInterrupt), storage.replacing(file) as name:
+    (tmp_path / f"film{files.TEMPORARY}.mp4").symlink_to(tmp_path / "elsewhere")
+    with suppress(OSError, KeyboardInterrupt), files.replacing(file) as name:
         assert name.suffix == ".mp4"
         _write_half(name, fail)
     found = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -276,5 +276,5 @@ def test_a_file_that_another_library_writes_is_replaced_whole(
 
 
 def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="directory"), storage.replacing(tmp_path):
+    with pytest.raises(OSError, match="directory"), files.replacing(tmp_path):
         raise AssertionError("nothing is to be written")

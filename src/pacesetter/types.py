@@ -1,4 +1,7 @@
-"""Names for the arrays that every part of the program hands on; imports no JAX."""
+"""Names for the arrays that every part of the program hands on, and how large their numbers may be.
+
+What lies beyond is a fault, though float32 could hold it. Imports no JAX.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,3 +15,17 @@ Numbers = NDArray[np.int64]
 Arrays = dict[str, NDArray[Any]]
 Shape = tuple[int, ...]
 Layers = Sequence[dict[str, Floats]]
+
+# Of observations, rewards and actions: a loss squares what it is made of.
+LARGEST = float(np.sqrt(np.finfo(np.float32).max))
+# Of losses, weights and moments: so near to infinity that the next products reach it.
+DIVERGED = 1e30
+ALLOWED = f"finite and at most {LARGEST:.1e} in size"
+
+
+def worst(array: NDArray[Any], limit: float) -> float | None:
+    """A number of an array that is NaN or beyond +-limit; None if there is none."""
+    if not array.size:
+        return None
+    ends = float(array.min()), float(array.max())  # NaN, if there is one
+    return next((end for end in ends if not abs(end) <= limit), None)

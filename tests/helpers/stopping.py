@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from short_runs import run_to_end
 
-from pacesetter import storage
+from pacesetter import files, storage
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.training.trainer import Trainer
 
@@ -68,7 +68,7 @@ def only_run(runs: Path) -> RunDirectory:
 
 def litter(directory: RunDirectory) -> list[Path]:
     """What half-written files a run has left."""
-    return list(directory.path.rglob(f"*{storage.TEMPORARY}"))
+    return list(directory.path.rglob(f"*{files.TEMPORARY}"))
 
 
 def saved_step(directory: RunDirectory) -> int:

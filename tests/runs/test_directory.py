@@ -12,7 +12,7 @@ import pytest
 from odd_places import folder, pipe
 from short_runs import TINY, assert_same, log, run_to_end
 
-from pacesetter import storage
+from pacesetter import files
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find, find_all
@@ -118,9 +118,9 @@ def test_a_start_that_fails_leaves_what_was_there(
 def test_litter_of_a_killed_process_is_swept(run: RunDirectory) -> None:
     for place in (run.path, run.policies, run.state_file.parent):
         place.mkdir(exist_ok=True)
-        (place / f"file{storage.TEMPORARY}").touch()
+        (place / f"file{files.TEMPORARY}").touch()
     Trainer.resume(run.path).close()
-    assert not [*run.path.rglob(f"*{storage.TEMPORARY}")]
+    assert not [*run.path.rglob(f"*{files.TEMPORARY}")]
 
 
 def test_a_name_too_long_leaves_nothing(
@@ -208,7 +208,7 @@ def test_what_is_no_file_is_renamed_where_a_run_writes_one(
     assert any(f"{path}" in note and "is not a regular file" in note for note in trainer.notes)
     assert_same(whole, run_to_end(trainer))
     assert log(run) == log(whole)
-    assert storage.is_regular(path)
+    assert files.is_regular(path)
     aside = path.with_name(f"{path.name}.aside")
     assert os.lstat(aside).st_mode == kind
     if odd is folder:

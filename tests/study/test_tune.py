@@ -92,7 +92,7 @@ def test_what_td3_searches() -> None:
     """Nothing that changes the number of updates; DDPG's fixed settings are not searched."""
     searched = {"gamma", "normalize_observation", "batch_size", "warmup", "actor_learning_rate"}
     searched |= {"critic_learning_rate", "tau", "policy_delay", "target_noise"}
-    searched |= {"exploration_noise", "critic_layer_norm", "actor_layer_norm"}
+    searched |= {"exploration_noise", "critic_layer_norm", "actor_layer_norm", "normalize_reward"}
     assert set(ranges(algorithms.find("td3").Hyper, {})) == searched
     ddpg = set(ranges(algorithms.find("ddpg").Hyper, {}))
     assert ddpg == searched - {"policy_delay", "target_noise"}

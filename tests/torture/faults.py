@@ -16,8 +16,8 @@ from pacesetter import storage
 from pacesetter.ensemble.updates import CHECK_EVERY
 from pacesetter.errors import TrainingError
 from pacesetter.learner.tree_arrays import flatten
-from pacesetter.limits import DIVERGED, LARGEST, worst
 from pacesetter.training.trainer import Trainer
+from pacesetter.types import DIVERGED, LARGEST, worst
 
 SETTINGS: dict[str, Any] = TINY | {"hidden": (8,), "steps": 600, "eval_every": 300}
 ROLLOUTS: dict[str, Any] = {"parallel_envs": 2, "rollout_length": 20}

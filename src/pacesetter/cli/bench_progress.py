@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from pacesetter.cli.progress import Pace, bars
+from pacesetter.files import regular
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.storage import FAULTS, regular
+from pacesetter.storage import FAULTS
 from pacesetter.study.bench.queue import Bench
 from pacesetter.study.bench.suite import Job
 

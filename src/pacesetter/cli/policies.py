@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pacesetter.cli.flags import Parser, split_env_kwargs
 from pacesetter.consent import require
 from pacesetter.errors import UsageError, unknown
+from pacesetter.files import NOT_REGULAR, is_regular, present
 from pacesetter.settings import Settings
-from pacesetter.storage import NOT_REGULAR, is_regular, present
 
 if TYPE_CHECKING:
     from pacesetter.policy import Policy

@@ -12,11 +12,10 @@ from pacesetter.envs import Environment, Snapshot
 from pacesetter.errors import TrainingError
 from pacesetter.learner.scales import scaled
 from pacesetter.learner.tree_arrays import flatten, rebuild
-from pacesetter.limits import ALLOWED, LARGEST
 from pacesetter.networks.forward import clip
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings.validation import Finite, Natural, check
-from pacesetter.types import Arrays, Floats
+from pacesetter.types import ALLOWED, LARGEST, Arrays, Floats
 
 
 @dataclass

@@ -10,10 +10,9 @@ from pydantic import Field
 from pacesetter.ensemble.rules import Choice
 from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
-from pacesetter.limits import DIVERGED
 from pacesetter.settings.budget import Standing
 from pacesetter.settings.validation import Finite, Natural, check
-from pacesetter.types import Arrays, Floats
+from pacesetter.types import DIVERGED, Arrays, Floats
 
 TRAIN_ROW_EVERY = 1_000  # steps
 

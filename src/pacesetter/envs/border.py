@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pacesetter.errors import show
-from pacesetter.limits import ALLOWED, LARGEST
-from pacesetter.types import Floats, Shape
+from pacesetter.types import ALLOWED, LARGEST, Floats, Shape
 
 ROUNDING = 1e-6  # of a bound; float32 has seven digits
 

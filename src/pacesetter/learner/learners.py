@@ -14,11 +14,10 @@ from pacesetter.errors import TrainingError
 from pacesetter.learner.compiled import CompiledLearner, MemberUpdate
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.tree_arrays import flatten, rebuild
-from pacesetter.limits import DIVERGED, worst
 from pacesetter.policy import Policy
 from pacesetter.process import threads
 from pacesetter.seeding import Stream, generator
-from pacesetter.types import Arrays
+from pacesetter.types import DIVERGED, Arrays, worst
 
 
 class Learners:

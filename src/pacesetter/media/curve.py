@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.files import replacing
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.storage import replacing
 
 COLOUR = "tab:blue"
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import Evaluation, evaluate
+from pacesetter.files import present
 from pacesetter.media.extras import need
 from pacesetter.policy import Policy, load
 from pacesetter.runs import RunDirectory
-from pacesetter.storage import present
 
 INSTALL = "pacesetter[hub]"
 FILE, CARD, VIDEO = "policy.safetensors", "README.md", "replay.mp4"  # the hub plays a replay.mp4

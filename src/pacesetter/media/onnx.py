@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pacesetter.errors import UsageError
+from pacesetter.files import write_atomically
 from pacesetter.media.extras import need
 from pacesetter.networks.forward import (
     ACTIVATIONS,
@@ -19,7 +20,6 @@ from pacesetter.networks.forward import (
     has_encoder,
 )
 from pacesetter.policy import OBSERVATION_LIMIT, Floats, Layers, Policy, to_env
-from pacesetter.storage import write_atomically
 
 INSTALL = "pacesetter[onnx]"
 OPSET, IR = 17, 8  # of 2022: runtimes from onnxruntime 1.12 on read them

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
+from pacesetter.files import replacing
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene
 from pacesetter.policy import Policy
-from pacesetter.storage import replacing
 
 GAP = 6  # pixels of white between frames
 ALIKE = 0.3  # autocorrelation from which a movement counts as one that repeats

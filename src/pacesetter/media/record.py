@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
+from pacesetter.files import replacing
 from pacesetter.media.caption import caption
 from pacesetter.media.scene import INSTALL as INSTALL
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene, setting
 from pacesetter.policy import Policy
-from pacesetter.storage import replacing
 
 SUFFIXES = (".mp4", ".gif")
 FASTEST = 50.0  # frames per second; a GIF knows no more and eyes see no more

@@ -5,8 +5,8 @@ from typing import Any
 
 from pacesetter.consent import require
 from pacesetter.errors import UsageError
+from pacesetter.files import write_atomically
 from pacesetter.policy import Floats, Policy
-from pacesetter.storage import write_atomically
 
 SCRIPT = '''"""`model` is a policy as Stable-Baselines3 expects one; run it to evaluate."""
 

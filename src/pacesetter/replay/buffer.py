@@ -13,10 +13,11 @@ import numpy as np
 
 from pacesetter.batch import Layout, Transition
 from pacesetter.errors import UsageError
+from pacesetter.files import make_folder, regular, reserve
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError
 from pacesetter.replay.sampler import Sampler
-from pacesetter.storage import digest, make_folder, regular, reserve
+from pacesetter.storage import digest
 from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together

@@ -12,21 +12,21 @@ from typing import Any
 from pacesetter.config import Config, resolve
 from pacesetter.consent import require, words
 from pacesetter.errors import InUseError, UsageError
-from pacesetter.runs.lock import WITHOUT, Lock
-from pacesetter.runs.log import Log, Row
-from pacesetter.runs.provenance import provenance
-from pacesetter.runs.records import SCHEMA, check_record
-from pacesetter.settings.validation import difference
-from pacesetter.storage import (
+from pacesetter.files import (
     NOT_REGULAR,
     TEMPORARY,
-    as_json,
     is_regular,
     make_folder,
     present,
     read_bytes,
     write_atomically,
 )
+from pacesetter.runs.lock import WITHOUT, Lock
+from pacesetter.runs.log import Log, Row
+from pacesetter.runs.provenance import provenance
+from pacesetter.runs.records import SCHEMA, check_record
+from pacesetter.settings.validation import difference
+from pacesetter.storage import as_json
 
 CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.

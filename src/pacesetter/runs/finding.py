@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 
 from pacesetter.errors import UsageError
+from pacesetter.files import present
 from pacesetter.runs.directory import CONFIG, RunDirectory
-from pacesetter.storage import present
 
 SHOWN = 4  # runs that a refusal names
 

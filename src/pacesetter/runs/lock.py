@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from pacesetter.errors import InUseError, UsageError
-from pacesetter.storage import regular
+from pacesetter.files import regular
 
 # What flock answers where the file system, such as some network ones, has no locks.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.files import present, read_bytes, regular, sync_folder
 from pacesetter.runs.records import check_row
-from pacesetter.storage import as_json, present, read_bytes, regular, sync_folder
+from pacesetter.storage import as_json
 
 Row = dict[str, Any]
 

@@ -9,9 +9,10 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
 from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.files import present, read_bytes, write_atomically
 from pacesetter.media.extras import look_for
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.storage import as_json, present, read_bytes, write_atomically
+from pacesetter.storage import as_json
 from pacesetter.tracking.sinks import SINKS, Tracked, Write
 
 FILE = "trackers.json"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pacesetter import storage
+from pacesetter import files, storage
 from pacesetter.config import Config
 from pacesetter.ensemble.loop import Loop
 from pacesetter.errors import TrainingError, UsageError
@@ -67,8 +67,8 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
 def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
     """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
     notes: list[str] = []
-    files = [directory.state_file, directory.previous_file]
-    for file in (file for file in files if storage.present(file)):
+    checkpoints = [directory.state_file, directory.previous_file]
+    for file in filter(files.present, checkpoints):
         try:
             _restore(loop, config, directory, file, notes)
         except Refused:
@@ -78,7 +78,7 @@ def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
             continue
         notes += directory.set_aside()
         if file != directory.state_file:  # the next save must not keep the damaged one instead
-            storage.link(file, directory.state_file)
+            files.link(file, directory.state_file)
         return notes
     if not notes and directory.log.read():
         notes = [f"{directory.state_file}: is missing"]

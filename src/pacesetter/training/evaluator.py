@@ -10,11 +10,11 @@ from pacesetter.ensemble.varied import shown
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import blame
 from pacesetter.evaluation import Act, Evaluation, rollouts
+from pacesetter.files import make_folder
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 from pacesetter.runs.provenance import versions
 from pacesetter.seeding import Stream
-from pacesetter.storage import make_folder
 from pacesetter.types import Floats
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter import storage
-from pacesetter.config import Config
+from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
 from pacesetter.settings import Settings
@@ -33,6 +33,14 @@ def fixed(config: Config) -> Settings:
     return json.loads(
         json.dumps({k: v for k, v in config.settings().items() if k not in FREE_ON_RESUME})
     )
+
+
+def with_new(config: Config, **given: Any) -> Config:
+    """The config with those of the given settings that are not None."""
+    changed = {name: value for name, value in given.items() if value is not None}
+    if not changed:
+        return config
+    return resolve(config.run.algorithm, config.run.env, config.settings() | changed)
 
 
 def refuse_other_settings(config: Config, directory: RunDirectory) -> None:

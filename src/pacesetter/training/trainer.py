@@ -32,31 +32,21 @@ from pacesetter.training.tasks import make_tasks
 if TYPE_CHECKING:
     from pacesetter.settings.typed import Name, RunSettings
 
+    class Settings(RunSettings, total=False):
+        runs: str | Path
+        config: str | Path | None
+
 
 class Trainer:
     """A run, new or resumed: iterate over it to train, break to stop; it goes on with `resume`."""
 
     @overload
     def __init__(
-        self,
-        algorithm: "Name",
-        env: str | Factory,
-        *,
-        runs: str | Path = "runs",
-        config: str | Path | None = None,
-        **settings: "Unpack[RunSettings]",
+        self, algorithm: "Name", env: str | Factory, **settings: "Unpack[Settings]"
     ) -> None: ...
 
     @overload  # presets and algorithms of other people
-    def __init__(
-        self,
-        algorithm: str,
-        env: str | Factory,
-        *,
-        runs: str | Path = "runs",
-        config: str | Path | None = None,
-        **settings: Any,
-    ) -> None: ...
+    def __init__(self, algorithm: str, env: str | Factory, **settings: Any) -> None: ...
 
     def __init__(
         self,
@@ -113,16 +103,15 @@ class Trainer:
         """
         self = cls.__new__(cls)
         self.directory = find(str(run), runs)
-        self.config = self.directory.config(allow)
-        given = {"steps": steps, "time": time, "stop_at": stop_at}
-        given |= {
-            "stop_patience": stop_patience,
-            "env_timeout": env_timeout,
-            "checkpoint_every": checkpoint_every,
-        }
-        if changed := {key: value for key, value in given.items() if value is not None}:
-            settings = self.config.settings() | changed
-            self.config = resolve(self.config.run.algorithm, self.config.run.env, settings)
+        self.config = identity.with_new(
+            self.directory.config(allow),
+            steps=steps,
+            time=time,
+            stop_at=stop_at,
+            stop_patience=stop_patience,
+            env_timeout=env_timeout,
+            checkpoint_every=checkpoint_every,
+        )
         identity.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
         self._begin(apart.recorded(self.directory.record()), env)

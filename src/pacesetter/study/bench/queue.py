@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
-from pacesetter import storage
+from pacesetter import files, storage
 from pacesetter.ensemble.progress import Progress
 from pacesetter.errors import InUseError, UsageError
 from pacesetter.process import CODES
@@ -67,7 +67,7 @@ def is_finished(job: Job) -> bool:
 
 def words_of(job: Job) -> list[str]:
     """The command that continues a run: `resume` if its folder holds one, else `train`."""
-    if storage.present(job.directory.config_file):
+    if files.present(job.directory.config_file):
         return [*job.directory.resume_words(job.config), *job.always, "-q"]
     return [*job.words, *job.always, "-q"]
 
@@ -168,7 +168,7 @@ class Bench:
                 self._end(job, words, outcome, stopped)
 
     def _end(self, job: Job, words: list[str], outcome: Outcome, stopped: bool) -> None:
-        overtaken = words[0] == "train" and storage.present(job.directory.config_file)
+        overtaken = words[0] == "train" and files.present(job.directory.config_file)
         held = outcome.code == IN_USE and job.directory.in_use()
         if is_finished(job):
             self._finish(job)
@@ -199,7 +199,7 @@ class Bench:
         file, text = job.directory.path / "failure.log", f"$ {shlex.join(words)}\n{outcome.output}"
         try:
             if file.parent.is_dir():
-                storage.write_atomically(file, text.encode(errors="backslashreplace"))
+                files.write_atomically(file, text.encode(errors="backslashreplace"))
         except OSError as error:  # no reason to give up the others
             self.news.append(f"{job}: cannot write {file}: {error.strerror}")
         self.failed[str(job)] = _last_line(outcome)

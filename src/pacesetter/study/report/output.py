@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 
 from pacesetter.errors import UsageError
-from pacesetter.storage import replacing, write_atomically
+from pacesetter.files import replacing, write_atomically
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
 from pacesetter.study.report import contents, contrasts, data, paper, tables

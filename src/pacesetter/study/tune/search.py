@@ -17,10 +17,10 @@ import numpy as np
 from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
+from pacesetter.files import make_folder, present, sync_folder, write_atomically
 from pacesetter.runs import Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
-from pacesetter.storage import make_folder, present, sync_folder, write_atomically
 from pacesetter.study.bench.suite import TUNING_SEEDS
 from pacesetter.study.tune.journal import (
     distribution,
