@@ -83,10 +83,10 @@ def test_one_seed_is_one_run(tmp_path: Path) -> None:
 
 def test_a_leak_is_seen(tmp_path: Path) -> None:
     """And a few trainings give back what they took."""
-    tally = memory.run(tmp_path, 3, leak=3_000)
+    tally = memory.run(tmp_path, 3, leak=60_000)  # 5,700 MB; what the heap has free hides some
     (leak,) = tally.wrong
     assert "MB more in 100,000 steps" in leak
-    assert 200 < tally.values["slope"] < 400
+    assert 1_000 < tally.values["slope"] < 6_000
     assert tally.values["trainings"] == 5
 
 
