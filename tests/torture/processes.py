@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -67,6 +68,7 @@ def signals(folder: Path, count: int, seed: int = 0) -> Tally:
             wait_for(partial(training, runs), process)
         moment = rng.uniform(0, 1) if in_training else rng.uniform(0.05, 3)
         time.sleep(moment)
+        begun = _handles_signals(process.pid)
         process.send_signal(sent)
         when = f"{sent.name} {moment:.1f} s after {'saving' if in_training else 'its start'}"
         began = time.monotonic()
@@ -80,10 +82,28 @@ def signals(folder: Path, count: int, seed: int = 0) -> Tally:
         finally:
             tally.made += 1
         tally.slowest = max(tally.slowest, time.monotonic() - began)
-        if fault := _fault(process.returncode, sent, err, runs):
+        if not begun:
+            tally.values["early"] = tally.values.get("early", 0) + 1
+            fault = "" if process.returncode and not runs.exists() else "it has begun all the same"
+        else:
+            fault = _fault(process.returncode, sent, err, runs)
+        if fault:
             tally.wrong.append(f"{when}: {fault}")
         shutil.rmtree(runs, ignore_errors=True)
     return tally
+
+
+def signals_told(tally: Tally) -> str:
+    """As the table tells it."""
+    early = f"of which {tally.values.get('early', 0):.0f} before the program's first instruction"
+    return f"{tally.made:,} made, {early}; {tally.of_processes().partition(', ')[2]}"
+
+
+def _handles_signals(process: int) -> bool:
+    """Whether the program has begun; before, Python starts up and answers signals by itself."""
+    status = Path(f"/proc/{process}/status").read_text()
+    (caught,) = re.findall(r"SigCgt:\s*(\w+)", status)
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
 
 
 def _fault(code: int, sent: signal.Signals, err: str, runs: Path) -> str:

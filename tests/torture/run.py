@@ -90,7 +90,7 @@ EXPERIMENTS = (
         processes.signals,
         12,
         200,
-        Tally.of_processes,
+        processes.signals_told,
     ),
     Experiment(
         "rude",
