@@ -7,17 +7,21 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from browsers import chromium
 from compare import make_run
+from selenium.webdriver.common.action_chains import ActionChains
 
 from pacesetter.cli.main import main
+from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
-from pacesetter.tracking.live import MOST_EPISODES, curve, serving
+from pacesetter.tracking.live import MOST_EPISODES, curve, curves, serving
 
 EVALUATIONS = 4
 
@@ -28,21 +32,34 @@ LEDGER = {"updates": 1_900, "wall_seconds": 40.0}
 @pytest.fixture
 def run(runs: Path) -> RunDirectory:
     """Four evaluations and a row of training, of a run that has made half its budget."""
-    run = RunDirectory(make_run(runs, budget=2_000, planned=4_000, evaluations=10))
-    run.metrics_file.unlink()
-    for step in range(0, 500 * EVALUATIONS, 500):
-        returns = [step - 10.0, step + 30.0]
-        run.log.append(
-            {"kind": "eval", "step": step, "returns": returns, "mean": step + 10.0} | LEDGER
-        )
+    run = evaluated(make_run(runs, budget=2_000, planned=4_000, evaluations=10), EVALUATIONS)
     ended = [[0, 100.0, 10], [0, 300.0, 10]]
     run.log.append({"kind": "train", "step": 2_000, "episodes_ended": ended} | LEDGER)
     return run
 
 
+def evaluated(path: Path, count: int) -> RunDirectory:
+    """The run there with so many evaluations as its log."""
+    run = RunDirectory(path)
+    run.metrics_file.unlink()
+    for step in range(0, 500 * count, 500):
+        returns = [step - 10.0, step + 30.0]
+        run.log.append(
+            {"kind": "eval", "step": step, "returns": returns, "mean": step + 10.0} | LEDGER
+        )
+    return run
+
+
 @pytest.fixture
 def port(run: RunDirectory) -> Iterator[int]:
-    with serving(run) as server:
+    with page_of([run]) as found:
+        yield found
+
+
+@contextmanager
+def page_of(runs: list[RunDirectory]) -> Iterator[int]:
+    """The port of their page."""
+    with serving(lambda: runs) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:
@@ -62,10 +79,11 @@ def get(port: int, path: str, host: str | None = None) -> tuple[int, str]:
 
 
 def test_the_curve_is_that_of_the_log(run: RunDirectory, port: int) -> None:
-    status, text = get(port, "/curve.json")
-    found = json.loads(text)
+    status, text = get(port, "/curves.json")
+    (found,) = json.loads(text)
     assert status == 200
     assert found == curve(run)
+    assert found["name"] == str(run.path)
     assert found["evaluations"][:2] == [[0, 10.0, -10.0, 30.0], [500, 510.0, 490.0, 530.0]]
     assert len(found["evaluations"]) == EVALUATIONS
     assert found["episodes"] == [[2_000, 0, 100.0], [2_000, 0, 300.0]]
@@ -74,14 +92,14 @@ def test_the_curve_is_that_of_the_log(run: RunDirectory, port: int) -> None:
 
 
 def test_a_row_that_is_being_written_is_left_out(run: RunDirectory, port: int) -> None:
-    before = get(port, "/curve.json")
+    before = get(port, "/curves.json")
     line = json.dumps(run.rows()[0] | {"step": 3_000})
     with run.metrics_file.open("a") as file:
         file.write(line[:40])
-    assert get(port, "/curve.json") == before
+    assert get(port, "/curves.json") == before
     with run.metrics_file.open("a") as file:
         file.write(line[40:] + "\n")
-    assert json.loads(get(port, "/curve.json")[1])["evaluations"][-1][0] == 3_000
+    assert json.loads(get(port, "/curves.json")[1])[0]["evaluations"][-1][0] == 3_000
 
 
 def test_a_return_that_is_no_number_is_left_out(run: RunDirectory) -> None:
@@ -101,18 +119,18 @@ def test_a_long_run_is_thinned(run: RunDirectory) -> None:
 
 def test_an_empty_or_damaged_log_ends_no_server(run: RunDirectory, port: int) -> None:
     run.metrics_file.write_text("{broken}\n")
-    status, text = get(port, "/curve.json")
+    status, text = get(port, "/curves.json")
     assert status == 500
     assert "damaged" in text
     run.metrics_file.unlink()
-    assert json.loads(get(port, "/curve.json")[1])["evaluations"] == []
+    assert json.loads(get(port, "/curves.json")[1])[0]["evaluations"] == []
 
 
 def test_only_this_machine_and_only_this_page(port: int) -> None:
     """A page of another site cannot read it through a name that it lets lead here."""
     assert get(port, "/")[0] == 200
     assert get(port, "/", f"localhost:{port}")[0] == 200
-    assert get(port, "/curve.json", f"evil.example:{port}")[0] == 403
+    assert get(port, "/curves.json", f"evil.example:{port}")[0] == 403
     assert get(port, "/../config.json")[0] == 404
 
 
@@ -121,6 +139,76 @@ def test_the_page_asks_no_network(port: int) -> None:
     assert "http:" not in text
     assert "https:" not in text
     assert "src=" not in text
+
+
+@pytest.fixture
+def several(run: RunDirectory, runs: Path) -> list[RunDirectory]:
+    """The run, another seed of it, and one whose log is damaged."""
+    other = evaluated(make_run(runs, seed=1, budget=3_000, evaluations=3), 3)
+    broken = RunDirectory(make_run(runs, name="sac", budget=2_000, evaluations=2))
+    broken.metrics_file.write_text("{broken}\n")
+    return [broken, run, other]
+
+
+def test_several_runs(several: list[RunDirectory]) -> None:
+    """Each by the name of `list runs`; a damaged one is told and does not hide the others."""
+    broken, *good = several
+    first, *found = curves(several)
+    assert found == [curve(run) for run in good]
+    assert [len(each["evaluations"]) for each in found] == [EVALUATIONS, 3]
+    assert first["name"] == str(broken.path)
+    assert "damaged" in first["fault"]
+    with pytest.raises(UsageError, match="damaged"):
+        curves([broken])
+
+
+def test_episodes_are_shared_out(run: RunDirectory, several: list[RunDirectory]) -> None:
+    """The page of many runs is no larger than that of one."""
+    ended = [[0, float(index), 10] for index in range(2 * MOST_EPISODES)]
+    run.log.append({"kind": "train", "step": 3_000, "episodes_ended": ended} | LEDGER)
+    found = {each["name"]: each for each in curves(several)}[str(run.path)]["episodes"]
+    assert MOST_EPISODES / 6 < len(found) <= MOST_EPISODES / 3
+
+
+def test_a_log_is_read_again_only_if_it_grew(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """But a state that is not in the log is always the one of now."""
+    before = curve(run)
+    read: list[Path] = []
+    rows = RunDirectory.rows
+    monkeypatch.setattr(RunDirectory, "rows", lambda self: (read.append(self.path), rows(self))[1])
+    run.lock()
+    assert curve(run) == before | {"is_running": True}
+    assert read == []
+    run.log.append(run.log.rows("eval")[0] | {"step": 3_000})
+    assert len(curve(run)["evaluations"]) == EVALUATIONS + 1
+    assert read == [run.path]
+    run.unlock()
+
+
+def test_a_folder_and_the_runs_that_start_later(
+    several: list[RunDirectory], runs: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder is looked at anew each time, and names that name a run twice show it once."""
+    looks: list[list[str]] = []
+
+    @contextmanager
+    def look(find: Any, port: int) -> Iterator[Any]:
+        looks.append([each["name"] for each in curves(find())])
+        evaluated(make_run(runs, "Ant-v5", budget=1_000, evaluations=1), 1)
+        looks.append([each["name"] for each in curves(find())])
+        yield SimpleNamespace(server_port=1, serve_forever=lambda: None)
+
+    monkeypatch.setattr("pacesetter.tracking.live.serving", look)
+    words = [str(runs), "HalfCheetah-v5/td3", str(several[1].path)]
+    assert main(["live", *words, "--runs", str(runs)]) == 0
+    names = [str(run.path) for run in several]
+    assert looks == [names, [f"{runs}/Ant-v5/td3/0", *names]]
+    told = capsys.readouterr()
+    assert "shows 3 runs; Ctrl-C ends it" in told.out
+    assert told.err.startswith("pacesetter: left out: ")
+    assert "damaged" in told.err
 
 
 def test_bad_input(runs: Path, run: RunDirectory, port: int, capsys: Any) -> None:
@@ -164,7 +252,35 @@ def test_the_page_draws_and_refreshes(run: RunDirectory, port: int, tmp_path: Pa
         assert browser.get_log("browser") == []
 
 
-def wait_for(browser: Any, expression: str, value: int) -> None:
+@pytest.mark.slow
+def test_the_page_of_several_runs(several: list[RunDirectory], tmp_path: Path) -> None:
+    """In a browser: a curve and an entry each; the numbers are of the chosen one."""
+    with page_of(several) as port, chromium(tmp_path / "profile") as browser:
+        narrow = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", narrow)
+        browser.get(f"http://127.0.0.1:{port}/")
+        wait_for(browser, "document.querySelectorAll('g[data-run]').length", 2)
+        assert browser.execute_script("return document.documentElement.scrollWidth") == 360
+        broken, first, second = browser.find_elements("css selector", "#runs button")
+        for button, run in zip((broken, first, second), several, strict=True):
+            assert button.find_element("tag name", "span").text == str(run.path)
+        assert not broken.is_enabled()
+        assert browser.find_element("id", "last").text == "1,510"
+        colour = "return getComputedStyle(document.querySelectorAll('g .line')[{}]).stroke"
+        assert len({browser.execute_script(colour.format(place)) for place in (0, 1)}) == 2
+        second.click()
+        chosen = curve(several[2])["evaluations"][-1][1]
+        wait_for(browser, "document.querySelector('g.picked').dataset.run", str(several[2].path))
+        assert browser.find_element("id", "picked").text == str(several[2].path)
+        assert float(browser.find_element("id", "last").text.replace(",", "")) == pytest.approx(
+            chosen, abs=0.05
+        )
+        ActionChains(browser).move_to_element(first).perform()
+        wait_for(browser, "document.querySelector('g.lit')?.dataset.run", str(several[1].path))
+        assert browser.get_log("browser") == []
+
+
+def wait_for(browser: Any, expression: str, value: Any) -> None:
     end = time.monotonic() + 30
     while browser.execute_script(f"return {expression}") != value:
         assert time.monotonic() < end, browser.execute_script(f"return {expression}")

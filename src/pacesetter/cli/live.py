@@ -1,28 +1,40 @@
 """The verb `live`."""
 
 import signal
+import sys
 
 from pacesetter.cli.flags import parser
-from pacesetter.runs import find
+from pacesetter.runs import RunDirectory, find_each
 
 
 def live(words: list[str]) -> int:
-    """Show a run's curve in a browser while it trains."""
-    command = parser("live", "Serve a page with a run's curve, for a browser of this machine.")
-    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
+    """Show curves of runs in a browser while they train."""
+    command = parser("live", "Serve a page with the curves of runs, for a browser of this machine.")
+    several = "run folders, folders of runs, ends of their paths or patterns"
+    command.add_argument("run", nargs="+", metavar="RUN", help=several)
     about = "port of the page (default any free one)"
     command.add_argument("--port", type=int, default=0, metavar="N", help=about)
     command.add_runs()
-    command.epilog = "The page reads metrics.jsonl every two seconds. Ctrl-C ends it."
+    command.epilog = (
+        "The page reads each metrics.jsonl every two seconds, and runs that start later join it. "
+        "Ctrl-C ends it."
+    )
     found = command.parse(words)
-    from pacesetter.tracking.live import serving
+    from pacesetter.tracking.live import curves, serving
 
-    run = find(found.run, found.runs)
-    run.record()  # damaged ones are refused here, not in the browser
+    def named() -> list[RunDirectory]:
+        every = [run for word in found.run for run in find_each(word, found.runs)]
+        return list({run.path.resolve(): run for run in every}.values())
+
+    runs = named()
+    for each in curves(runs):  # damaged ones are told here, not only in the browser
+        if "fault" in each:
+            print(f"pacesetter: left out: {each['fault']}", file=sys.stderr)
     try:
-        with serving(run, found.port) as server:
+        with serving(named, found.port) as server:
             page = f"http://127.0.0.1:{server.server_port}"
-            print(f"{page} shows {run.path}; Ctrl-C ends it", flush=True)
+            shown = runs[0].path if len(runs) == 1 else f"{len(runs)} runs"
+            print(f"{page} shows {shown}; Ctrl-C ends it", flush=True)
             server.serve_forever()
     except KeyboardInterrupt as end:  # which is how it is meant to end
         if end.args not in ((), (signal.SIGINT,)):

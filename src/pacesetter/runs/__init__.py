@@ -5,7 +5,7 @@ from pacesetter.runs.directory import (
     SCHEMA,
     RunDirectory,
 )
-from pacesetter.runs.finding import find, find_all, find_group, find_matching
+from pacesetter.runs.finding import find, find_all, find_each, find_group, find_matching
 from pacesetter.runs.log import Row
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "RunDirectory",
     "find",
     "find_all",
+    "find_each",
     "find_group",
     "find_matching",
 ]

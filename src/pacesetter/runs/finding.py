@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
+from glob import glob
 from pathlib import Path, PurePath
 
 from pacesetter.errors import UsageError
@@ -58,6 +59,21 @@ def find_matching(pattern: str, runs: str | Path = "runs") -> list[RunDirectory]
     """All runs that a pattern fits, with the seed or without it."""
     pattern = str(_plain(pattern))
     return _called(runs, lambda path: path.match(pattern) or path.parent.match(pattern))
+
+
+def find_each(word: str, runs: str | Path = "runs") -> list[RunDirectory]:
+    """The runs that a word names: a run, a folder of runs, the tail of either, or a pattern.
+
+    Raises UsageError if there is none.
+    """
+    if below := list(find_all(word) if Path(word).is_dir() else []):
+        return below
+    if not any(mark in word for mark in "*?["):
+        return find_group(word, runs) or [find(word, runs)]
+    below = [run for path in sorted(glob(word)) for run in find_all(path)]
+    if below := below + find_matching(word, runs):
+        return below
+    raise UsageError(f"run: '{word}' matches no run here or below {runs}")
 
 
 def _called(runs: str | Path, fits: Callable[[PurePath], bool]) -> list[RunDirectory]:

@@ -1,8 +1,9 @@
-"""A page on this machine with the curve of a run, read off its log as it grows."""
+"""A page on this machine with the curves of runs, read off their logs as they grow."""
 
 import json
-from collections.abc import Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -11,10 +12,14 @@ from typing import Any
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.settings.budget import budget
+from pacesetter.storage import FAULTS
+
+Runs = Callable[[], Iterable[RunDirectory]]  # asked at each look, so that new runs join
 
 ADDRESS = "127.0.0.1"
 PAGE = Path(__file__).with_name("live.html")
-MOST_EPISODES = 3_000  # dots that a browser draws at once
+MOST_EPISODES = 3_000  # of all runs, which a browser gets at once
+KEPT = 256  # logs that have not grown since they were read, and are not read again
 # The page may ask this server alone, and no page of another site may ask for it.
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; connect-src 'self'; img-src data:; "
@@ -24,15 +29,55 @@ HEADERS = {
 }
 
 
-def curve(run: RunDirectory) -> dict[str, Any]:
-    """What the page draws: steps and returns of evaluations, and of training episodes."""
-    rows, settings = run.rows(), run.settings()
+def curves(runs: Iterable[RunDirectory]) -> list[Row]:
+    """What the page draws: each run's curve, or its name and fault if it cannot be read.
+
+    Raises UsageError if none can.
+    """
+    every = list(runs)
+    found = [_curve_or_fault(run, MOST_EPISODES // len(every)) for run in every]
+    if found and all("fault" in each for each in found):
+        raise UsageError(found[0]["fault"])
+    return found
+
+
+def _curve_or_fault(run: RunDirectory, most: int) -> Row:
+    try:
+        return curve(run, most)
+    except UsageError as error:
+        return {"name": str(run.path), "fault": str(error)}
+    except FAULTS as error:
+        return {"name": str(run.path), "fault": f"{run.path}: damaged: {error}"}
+
+
+def curve(run: RunDirectory, most: int = MOST_EPISODES) -> Row:
+    """Steps and returns of a run's evaluations, and of at most so many training episodes."""
+    settings = run.settings()
     return {
+        "name": str(run.path),
         "title": f"{settings['env']}, {settings['name']}, seed {settings['seed']}",
         "budget": budget(settings),
         "is_running": run.in_use(),
+        **_logged(run.path, _size(run.metrics_file), most),
+    }
+
+
+def _size(file: Path) -> tuple[int, int] | None:
+    """What changes when a file does."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
+
+
+@lru_cache(KEPT)
+def _logged(run: Path, size: tuple[int, int] | None, most: int) -> Row:
+    """The part of a curve that comes from the log, whose size says whether it has grown."""
+    rows = RunDirectory(run).rows()
+    return {
         "evaluations": [_evaluation(row) for row in rows if row.get("mean") is not None],
-        "episodes": _episodes(rows),
+        "episodes": _episodes(rows, most),
         "spent": [[row["step"], row["wall_seconds"]] for row in rows[-20:]],
         "updates": rows[-1]["updates"] if rows else 0,
     }
@@ -42,22 +87,22 @@ def _evaluation(row: Row) -> list[float]:
     return [row["step"], row["mean"], min(row["returns"]), max(row["returns"])]
 
 
-def _episodes(rows: list[Row]) -> list[list[float]]:
+def _episodes(rows: list[Row], most: int) -> list[list[float]]:
     """Step of the row, member and return of the episodes; evenly spaced ones if they are many."""
     found = [(row["step"], each) for row in rows for each in row.get("episodes_ended", [])]
-    every = -(-len(found) // MOST_EPISODES) or 1
+    every = -(-len(found) // max(most, 1)) or 1
     return [[step, member, total] for step, (member, total, _) in found[::every]]
 
 
 @contextmanager
-def serving(run: RunDirectory, port: int = 0) -> Generator[ThreadingHTTPServer]:
+def serving(runs: Runs, port: int = 0) -> Generator[ThreadingHTTPServer]:
     """A server of the page, for `serve_forever`; port 0 is any free one. Only this machine sees it.
 
     Raises UsageError if the port is taken.
     """
 
     class Handler(_Handler):
-        directory = run
+        find = staticmethod(runs)
 
     try:
         server = ThreadingHTTPServer((ADDRESS, port), Handler)
@@ -69,25 +114,26 @@ def serving(run: RunDirectory, port: int = 0) -> Generator[ThreadingHTTPServer]:
 
 
 class _Handler(BaseHTTPRequestHandler):
-    directory: RunDirectory
+    find: Runs
     hosts: tuple[str, ...]
 
     def do_GET(self) -> None:
-        """The page, or the curve as it is now."""
+        """The page, or the curves as they are now."""
         if self.headers.get("Host") not in self.hosts:
             self.send_error(HTTPStatus.FORBIDDEN)  # a name of another site that leads here
         elif self.path == "/":
             self._send("text/html; charset=utf-8", PAGE.read_bytes())
-        elif self.path == "/curve.json":
-            self._send_curve()
+        elif self.path == "/curves.json":
+            self._send_curves()
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 
-    def _send_curve(self) -> None:
+    def _send_curves(self) -> None:
         try:
-            text = json.dumps(curve(self.directory))
-        except (UsageError, KeyError, TypeError, ValueError) as error:
-            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, f"the log is damaged: {error}")
+            text = json.dumps(curves(self.find()))
+        except UsageError as error:
+            # Escaped, since a folder may be named by any character, and this goes into a header.
+            self.send_error(HTTPStatus.INTERNAL_SERVER_ERROR, ascii(str(error))[1:-1])
             return
         self._send("application/json", text.encode())
 

@@ -3,12 +3,11 @@
 import json
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from glob import glob
 from pathlib import Path
 from typing import NamedTuple
 
 from pacesetter.errors import UsageError
-from pacesetter.runs import RunDirectory, find, find_all, find_group, find_matching
+from pacesetter.runs import RunDirectory, find_each
 from pacesetter.storage import FAULTS
 from pacesetter.study.compare.results import Run, compact, read
 
@@ -55,7 +54,7 @@ def _sources(word: str, runs: Path) -> Iterator[tuple[str, Callable[[str], Run |
         for number, line in enumerate(_lines(Path(word)), 1):
             yield f"{word}:{number}", partial(_of_line, line)
         return
-    for run in _directories(word, runs):
+    for run in find_each(word, runs):
         yield str(run.path), partial(_of_folder, run)
 
 
@@ -65,17 +64,6 @@ def _of_line(line: bytes, source: str) -> Run | None:
 
 def _of_folder(run: RunDirectory, source: str) -> Run | None:
     return read(source, compact(run), run.path)
-
-
-def _directories(word: str, runs: Path) -> list[RunDirectory]:
-    if below := list(find_all(word) if Path(word).is_dir() else []):
-        return below
-    if not any(mark in word for mark in "*?["):
-        return find_group(word, runs) or [find(word, runs)]
-    below = [run for path in sorted(glob(word)) for run in find_all(path)]
-    if below := below + find_matching(word, runs):
-        return below
-    raise UsageError(f"run: '{word}' matches no run here or below {runs}")
 
 
 def _lines(path: Path) -> list[bytes]:
