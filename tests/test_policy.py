@@ -116,6 +116,17 @@ def test_file_holds_all_of_a_policy(kind: str, tmp_path: Path, rng: np.random.Ge
     assert len(loaded.actors) == len(policy.actors)
 
 
+@pytest.mark.parametrize("wrap", [[7], [["a:B"]], "a:B"])
+def test_wrappers_of_a_file_are_names(
+    wrap: object, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    policy = make_policy("Walker2d-v5", rng)
+    policy.about["wrap"] = wrap
+    policy.save(tmp_path / "file")
+    with pytest.raises(UsageError, match="damaged policy: wrap must be a list"):
+        load(tmp_path / "file")
+
+
 @pytest.mark.parametrize("norm", [False, True])
 def test_numpy_equals_jax(norm: bool, rng: np.random.Generator) -> None:
     """The actor that was trained is the actor that is written."""

@@ -155,6 +155,8 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     for name, kind in kinds.items():
         if not isinstance(about.get(name, kind()), kind):
             raise ValueError(f"{name} must be a {kind.__name__}")
+    if not all(isinstance(wrapper, str) for wrapper in about.get("wrap", [])):
+        raise ValueError("wrap must be a list of names")
     for name in about.keys() & {"env", "algorithm", "name"}:
         check_id(about[name])
     for name, array in arrays.items():

@@ -183,6 +183,8 @@ BAD_SUITES = {
     "envs = ['A-v0']\nseeds = 0\n[entries.td3]": ["seeds", "0"],
     "envs = ['A-v0']\nseeds = [2147483648]\n[entries.td3]": ["seeds", "2147483647", "tune"],
     "envs = ['A-v0']\nseeds = [-1]\n[entries.td3]": ["seeds"],
+    "envs = ['A-v0']\nseeds = 2147483648\n[entries.td3]": ["seeds", "at most 1,000"],
+    f"envs = ['A-v0']\nseeds = {[*range(1001)]}\n[entries.td3]": ["seeds", "at most 1,000"],
     "envs = ['A-v0']\nseeds = true\n[entries.td3]": ["seeds", "True"],
     "envs = ['A-v0']\ngama = 1\n[entries.td3]": ["entry td3", "gama", "gamma"],
     "envs = ['A-v0']\n[entries.td3]\ngamma = 2": ["entry td3", "gamma", "1", "2"],

@@ -24,7 +24,7 @@ from pacesetter.config import resolve
 from pacesetter.process import CODES
 from pacesetter.replay import buffer
 from pacesetter.runs import RunDirectory
-from pacesetter.settings import OffPolicy, OnPolicy
+from pacesetter.settings import ModelDriven, OffPolicy, OnPolicy
 
 PROGRAM = Path(__file__).with_name("disturbed.py")
 POINTS = 10  # of one run
@@ -35,6 +35,7 @@ TASKS = ("Pendulum-v1", "HalfCheetah-v5", "Hopper-v5", f"Walker2d-v5 {N_STEP}")
 EVERY = "--steps 3000 --hidden 16 16 --eval-every 1500 --eval-episodes 1 --checkpoint-every 0.2s -q"
 OFF_POLICY = "--batch-size 16 --warmup 200 --replay-size 300"
 ON_POLICY = "--rollout-length 50 --parallel-envs 2"
+MODEL_DRIVEN = "--steps 3500 --rollout-length 250"  # more iterations than points
 MODELS = "--model-hidden 8 --head-hidden 8 --critic-members 2"
 OWN = {
     "crossq": "--critic-hidden 16 16 --renorm-after 100",
@@ -42,8 +43,8 @@ OWN = {
     "sunrise-td3": "--ensemble 3",
     "steve": MODELS,
     "steve-td3": MODELS,
-    "me-trpo": "--models 2 --model-hidden 8 --model-batch-size 50 --model-rows 500 --horizon 20 "
-    "--imagined-steps 200 --policy-updates 3",
+    "me-trpo": "--models 2 --model-hidden 8 --model-batch-size 100 --model-rows 500 --horizon 20 "
+    "--model-patience 1 --imagined-steps 100 --policy-updates 2 --critic-epochs 1",
 }
 
 
@@ -75,12 +76,18 @@ def _words(name: str, task: str) -> list[str]:
     base = name.removeprefix("multi-")
     hyper = algorithms.find(base).Hyper
     words = ["train", name, task.split()[0], *EVERY.split(), *OWN.get(base, "").split()]
-    words += (ON_POLICY if issubclass(hyper, OnPolicy) else OFF_POLICY).split()
+    words += _data(hyper).split()
     if N_STEP in task and issubclass(hyper, OffPolicy) and "steve" not in base:
         words += ["--n-step", "3"]
     if base == "me-trpo" and task == "Pendulum-v1":  # whose reward it must learn
         words.append("--no-known")
     return words
+
+
+def _data(hyper: type) -> str:
+    if issubclass(hyper, OnPolicy):
+        return MODEL_DRIVEN if issubclass(hyper, ModelDriven) else ON_POLICY
+    return OFF_POLICY
 
 
 def _pair(folder: Path, words: list[str], points: int, rng: random.Random) -> None:

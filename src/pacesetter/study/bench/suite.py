@@ -15,7 +15,7 @@ from pacesetter.settings import Settings
 from pacesetter.settings.files import read_file
 
 FOLDER = Path(__file__).with_name("suites")
-MOST_SEEDS = 10_000
+MOST_SEEDS = 1_000  # of one entry, so that a slip of the pen is no list of a million runs
 TUNING_SEEDS = 2**31  # seeds of `tune` start here and seeds of `bench` end here, so none is both
 DECIDED = ("algorithm", "env", "name", "seed")
 
@@ -179,7 +179,10 @@ def _envs(value: Any) -> list[str]:
 
 
 def _seeds(value: Any) -> list[int]:
-    seeds = list(range(min(value, MOST_SEEDS))) if type(value) is int else value
+    count = value if type(value) is int else len(value) if isinstance(value, list) else 0
+    if count > MOST_SEEDS:
+        raise UsageError(f"seeds: must be at most {MOST_SEEDS:,} per entry")
+    seeds: Any = list(range(value)) if type(value) is int else value
     whole = isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
     if not whole or not seeds:
         raise UsageError(f"seeds: must be how many, or a list of them, got {value!r}")
