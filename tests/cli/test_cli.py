@@ -371,7 +371,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "sac": (
         "--steps 300 --hidden 8 --batch-size 8 --warmup 50 --replay return --replay-exponent 0.5 "
         "--replay-importance 0.3 --replay-horizon 1000 --replay-to-go --n-step 3 --assess 2 "
-        "--assess-after 100",
+        "--assess-after 100 --actor-observes :2",
         {},
     ),
     "multi-sac": (

@@ -99,6 +99,13 @@ class Learner:
             "run that it comes from"
         )
 
+    def blinded(self, state: State, seen: Array) -> State:
+        """The state whose actor has no weight on the numbers of an observation that are not `seen`
+        (O,) (`--actor-observes`); it is asked for after every update.
+        """
+        name = type(self).__name__
+        raise UsageError(f"actor_observes: {name} cannot hide anything from its actor")
+
     def copy_weights(self, own: State, parent: State) -> State:
         """The parent's networks with the member's own optimiser state (`--copy weights`)."""
         raise UsageError(f"copy: {type(self).__name__} copies whole states only; allowed: full")

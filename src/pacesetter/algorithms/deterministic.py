@@ -45,6 +45,12 @@ class DeterministicLearner(Learner):
         actor = mlp.replaced(state.actor, layers)
         return state._replace(actor=actor, target_actor=jax.tree.map(jnp.copy, actor))
 
+    def blinded(self, state: Any, seen: Any) -> Any:
+        actor, target_actor = state.actor, state.target_actor
+        return state._replace(
+            actor=mlp.blinded(actor, seen), target_actor=mlp.blinded(target_actor, seen)
+        )
+
     def copy_weights(self, own: Any, parent: Any) -> Any:
         return parent._replace(
             actor_opt_state=own.actor_opt_state,

@@ -56,6 +56,9 @@ class StochasticLearner(Learner):
         joined = {name: np.concatenate([mean[name], spread[name]], axis=-1) for name in mean}
         return state._replace(actor=mlp.replaced(state.actor, [*hidden, joined]))
 
+    def blinded(self, state: Any, seen: Array) -> Any:
+        return state._replace(actor=mlp.blinded(state.actor, seen))
+
     def copy_weights(self, own: Any, parent: Any) -> Any:
         return parent._replace(
             actor_opt_state=own.actor_opt_state,

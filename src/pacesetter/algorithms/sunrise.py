@@ -188,6 +188,9 @@ class Sunrise(Learner):
         """One learner's actor update."""
         return self.base.fit_actor(state, batch, key, weight)
 
+    def blinded(self, state: State, seen: Array) -> State:
+        return self.base.blinded(state, seen)
+
     # How it acts.
 
     @property

@@ -253,6 +253,8 @@ class TD7(DeterministicLearner):
 
     with_actor = Learner.with_actor  # an actor reads the encoder that its critics read too
 
+    blinded = Learner.blinded  # an actor reads the encoder, which sees all
+
     def copy_weights(self, own: State, parent: State) -> State:
         copied = super().copy_weights(own, parent)
         return copied._replace(encoder_opt_state=own.encoder_opt_state)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from optax import incremental_update
 
 from pacesetter.algorithms.contract import Array, Learner, State
@@ -25,6 +26,7 @@ from pacesetter.learner.precision import bfloat16_products
 from pacesetter.learner.scales import scaled
 from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
 from pacesetter.seeding import Stream, generator
+from pacesetter.settings.values import chosen
 from pacesetter.types import Floats
 
 KEYS = 1024  # made in one call: in the update itself they would come before every product
@@ -56,7 +58,9 @@ class CompiledLearner:
         seed: int,
         normalize: bool,
         precision: str = "f32",
+        seen: NDArray[np.bool_] | None = None,
     ) -> None:
+        """`seen` (O,) tells what the actor sees of an observation; None is all of it."""
         self.learner, self.layout, self.normalize = learner, layout, normalize
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: learner.init(_key(key, KeyUse.INIT, 0, member)))
@@ -66,7 +70,7 @@ class CompiledLearner:
             lambda ema, state, tau: incremental_update(learner.policy(state).layers, ema, tau)
         )
         self._keys = lru_cache(maxsize=1024)(partial(_keys_of, jax.jit(_fold_keys), self.key))
-        self._program = _Program(learner, layout, normalize, jax.random.key_impl(self.key))
+        self._program = _Program(learner, layout, normalize, jax.random.key_impl(self.key), seen)
         update = self._program.update
         if precision == "bf16":
             update = bfloat16_products(update)
@@ -75,6 +79,10 @@ class CompiledLearner:
     def init(self, members: int, same: bool) -> list[State]:
         """New states; `same` gives every member the same weights."""
         return [self._init(self.key, 0 if same else member) for member in range(members)]
+
+    def blinded(self, state: State) -> State:
+        """A state whose actor sees no more than it may; each update gives such a one."""
+        return self._program.blinded(state)
 
     def policy_params(self, states: Sequence[State]) -> list[Any]:
         """What each member acts with, as NumPy arrays that no later update touches."""
@@ -142,6 +150,7 @@ class _Program(NamedTuple):
     layout: Layout
     normalize: bool
     impl: Any  # of the random keys
+    seen: NDArray[np.bool_] | None  # what the actor sees of an observation (O,), None all
 
     def update(
         self,
@@ -163,8 +172,16 @@ class _Program(NamedTuple):
         update = learner.update(state, batch, whole)
         losses = jnp.stack([update.losses[name] for name in sorted(update.losses)])
         # Buffers of their own: a state that NumPy looks into cannot be donated without a copy.
-        params = jax.tree.map(jnp.copy, self.learner.policy_params(update.state))
-        return update.state, losses, update.td_error, params
+        after = self.blinded(update.state)
+        params = jax.tree.map(jnp.copy, self.learner.policy_params(after))
+        return after, losses, update.td_error, params
+
+    def blinded(self, state: State) -> State:
+        """Weights are set to 0 after a step, not gradients before it: Adam moves each weight by its
+        own gradient alone, so the others learn the same. (With crossq's --weight-norm nearly so:
+        the length of a unit's weights counts the step of those.)
+        """
+        return state if self.seen is None else self.learner.blinded(state, jnp.asarray(self.seen))
 
     def batch(self, rows: Any, weight: Any, statistics: Any, extra: dict[str, Any]) -> Any:
         """Rows (U, B, width) as a batch that the learner takes."""
@@ -200,7 +217,11 @@ def of_transitions(learner: Learner, seed: int) -> CompiledLearner:
     """The program of a learner on a replay, whose rows have the masks that it wants."""
     hyper, masks = learner.hyper, len(learner.mask(generator(0, Stream.MASK)))
     layout = Layout(learner.spec, masks=masks)
-    return CompiledLearner(learner, layout, seed, hyper.normalize_observation, hyper.precision)
+    words, size = hyper.actor_observes, learner.spec.observation_size
+    seen = None if words is None else np.array(chosen("actor_observes", words, size))
+    return CompiledLearner(
+        learner, layout, seed, hyper.normalize_observation, hyper.precision, seen
+    )
 
 
 def _key(key: Array, use: KeyUse, call: Any, member: Any) -> Array:

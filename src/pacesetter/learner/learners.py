@@ -35,8 +35,8 @@ class Learners:
 
     def replace(self, states: list[State]) -> None:
         """Go on from other states."""
-        self.states = states
-        self.policy_params = self.compiled.policy_params(states)
+        self.states = [self.compiled.blinded(state) for state in states]
+        self.policy_params = self.compiled.policy_params(self.states)
 
     def update(self, members: Sequence[int], inputs: Sequence[Any]) -> list[MemberUpdate]:
         """One call of the update of each of these members; inputs are those of `compiled.update`

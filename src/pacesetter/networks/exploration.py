@@ -25,6 +25,8 @@ Rng = np.random.Generator
 def _fits_all_layers(kind: str, info: ValidationInfo) -> str:
     if kind == "parameter" and not info.data.get("actor_layer_norm"):
         raise ValueError("needs --actor-layer-norm, so that one sigma fits all layers")
+    if kind == "parameter" and info.data.get("actor_observes"):
+        raise ValueError("would put noise on weights that --actor-observes keeps at 0")
     return kind
 
 

@@ -139,6 +139,12 @@ def apply_gradient(
     return optax.apply_updates(params, change), opt_state
 
 
+def blinded(network: Network, seen: Array) -> Network:
+    """The network with weights of 0 on the inputs that are not `seen` (inputs,)."""
+    first, *others = network
+    return ({**first, "kernel": jnp.where(seen[:, None], first["kernel"], 0)}, *others)
+
+
 def replaced(network: Network, layers: Layers) -> Network:
     """The network with other layers of the same shapes; a ValueError says what does not fit."""
     shapes = [

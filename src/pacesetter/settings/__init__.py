@@ -5,7 +5,16 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
-from pacesetter.settings.values import Count, LearningRate, Switch, Tau, Tune, Warmup, Width
+from pacesetter.settings.values import (
+    Count,
+    LearningRate,
+    Numbers,
+    Switch,
+    Tau,
+    Tune,
+    Warmup,
+    Width,
+)
 
 Settings = dict[str, Any]
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -148,6 +157,11 @@ class OffPolicy(Hyper):
     )
     lr_horizon: Annotated[Count | None, AfterValidator(_check_horizon)] = Field(
         None, ge=1, description="env steps until that share is reached; default --steps"
+    )
+    actor_observes: Numbers | None = Field(
+        None,
+        description="numbers of the flat observation that the actor sees, such as 0:17 or 0:8,12; "
+        "critics see all; default all",
     )
     normalize_reward: Switch = Field(
         False,

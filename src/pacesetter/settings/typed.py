@@ -125,6 +125,8 @@ class RunSettings(TypedDict, total=False):
     """share of every learning rate that is left at the end; it falls linearly"""
     lr_horizon: int | str | None
     """env steps until that share is reached; default --steps"""
+    actor_observes: str | None
+    """numbers of the flat observation that the actor sees, such as 0:17 or 0:8,12; critics..."""
     normalize_reward: bool
     """divide rewards by the running standard deviation of discounted returns"""
     precision: Literal["f32", "bf16"]

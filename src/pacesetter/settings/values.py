@@ -3,7 +3,9 @@
 import re
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from pacesetter.errors import UsageError
 
 _MULTIPLES = {"": 1, "k": 1_000, "m": 1_000_000}
 _SECONDS = {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -26,6 +28,29 @@ def _duration(value: object) -> object:
     if value is not None and found is None:
         raise ValueError("is not a length of time; write 90s, 5m or 2h")
     return value if found is None else float(found[1]) * _SECONDS[found[2]]
+
+
+def _numbers(words: str) -> str:
+    each = r"(-?\d+|(-?\d+)?:(-?\d+)?)"
+    if not re.fullmatch(f"{each}(,{each})*", words):
+        raise ValueError("is no list of numbers and ranges; write 0:17, :-4 or 0:8,12")
+    return words
+
+
+def chosen(name: str, words: str, size: int) -> list[bool]:
+    """Which of so many numbers the words of a setting choose; ranges are as in Python.
+
+    Raises UsageError for a number that there is not, and for a range without any.
+    """
+    every = [False] * size
+    for word in words.split(","):
+        first, *last = (int(end) if end else None for end in word.split(":"))
+        found = range(size)[first : last[0] if last else (first or 0) + 1 or None]
+        if not found or any(abs(end or 0) > size for end in (first, *last)):
+            raise UsageError(f"{name}: {word} is not among the {size} numbers 0:{size}")
+        for number in found:
+            every[number] = True
+    return every
 
 
 def values_by_name(value: Any) -> Any:
@@ -60,6 +85,7 @@ class Tune(NamedTuple):
 
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Count = Annotated[int, BeforeValidator(_count)]
+Numbers = Annotated[str, AfterValidator(_numbers)]
 Duration = Annotated[float, BeforeValidator(_duration)]
 LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
 Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]

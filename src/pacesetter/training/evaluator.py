@@ -38,6 +38,8 @@ class Evaluator:
         policy.about.update({name: getattr(run, name) for name in names})
         policy.about.update(wrap=[*self.recipe.wrap], renew_env=self.recipe.renew)
         policy.about.update(step=progress.step, versions=versions())
+        if seen := getattr(self.config.hyper, "actor_observes", None):
+            policy.about["actor_observes"] = seen
         return policy
 
     def evaluate(self, ending: bool) -> dict[str, Any]:
