@@ -67,6 +67,25 @@ def absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     products.loaded.cache_clear()
 
 
+class OtherProcessor:
+    """A library that knows no product on this processor."""
+
+    def __init__(self, file: str, **mode: Any) -> None:
+        self.product, self.fits = None, lambda *sizes: False
+
+
+def test_a_library_for_another_processor_is_as_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that no run's record names a maker of products who makes none."""
+    monkeypatch.setattr(products.ctypes, "CDLL", OtherProcessor)
+    monkeypatch.setattr(jax.ffi, "pycapsule", lambda function: function)
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda *words, **more: None)
+    products.loaded.cache_clear()
+    try:
+        assert [*map(way, NAMES)] == ["xla", "xla"]
+    finally:
+        products.loaded.cache_clear()
+
+
 def normal(*shape: int) -> Any:
     return jnp.asarray(RNG.standard_normal(shape), jnp.float32)
 

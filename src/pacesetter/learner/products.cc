@@ -1,23 +1,17 @@
 // Float32 matrix products by libxsmm, for XLA to call.
 //
-// A product is made in blocks of columns. Who makes a block changes none of its bits, so results
-// are the same for any number of threads.
+// A part of a product is a block of columns.
 
 #include <libxsmm.h>
 
 #include <algorithm>
-#include <atomic>
-#include <memory>
 #include <vector>
 
-#include "xla/ffi/api/ffi.h"
+#include "parts.h"
 
 namespace {
 
-namespace ffi = xla::ffi;
-
-constexpr int kWidth = 64;       // columns of a block
-constexpr double kShared = 4e6;  // operations from which several threads are quicker than one
+constexpr int kWidth = 64;  // columns of a block
 
 struct alignas(64) Line {
   float numbers[16];
@@ -41,17 +35,14 @@ struct Sizes {
   }
 };
 
-// One call: its operands, and the blocks that are left.
+// One call: its operands, and how many blocks each network has.
 struct Work {
   Sizes sizes;
   const float* left;
   const float* right;
   float* out;
-  int blocks;  // of each network
-  int total;
+  int blocks;
   libxsmm_smmfunction whole, rest;
-  ffi::CountDownPromise made;
-  std::atomic<int> next{0};
 
   void block(int index) const {
     const auto& [m, n, k, left_t, right_t] = sizes;
@@ -70,13 +61,6 @@ struct Work {
     const auto call = width == kWidth ? whole : rest;
     call(from, left + network * m * k, out + network * m * n + at);
   }
-
-  void drain() {
-    for (int index; (index = next.fetch_add(1)) < total;) {
-      block(index);
-      made.CountDown();
-    }
-  }
 };
 
 ffi::Future Product(ffi::ThreadPool pool, bool left_t, bool right_t, ffi::Buffer<ffi::F32> left,
@@ -84,37 +68,16 @@ ffi::Future Product(ffi::ThreadPool pool, bool left_t, bool right_t, ffi::Buffer
   const auto shape = out->dimensions();
   const int m = shape[shape.size() - 2], n = shape.back(), pair = out->element_count() / m / n;
   const int k = left.element_count() / pair / m;
-  auto work = std::make_shared<Work>();
-  work->sizes = {m, n, k, left_t, right_t};
-  work->left = left.typed_data();
-  work->right = right.typed_data();
-  work->out = out->typed_data();
-  work->blocks = (n + kWidth - 1) / kWidth;
-  work->total = pair * work->blocks;
-  work->whole = work->sizes.kernel(kWidth);
-  work->rest = work->sizes.kernel(n % kWidth);
-  work->made = ffi::CountDownPromise(work->total);
-  ffi::Future future(work->made);
-  if (2.0 * pair * m * n * k >= kShared) {
-    const int helpers = std::min<int>(pool.num_threads(), work->total) - 1;
-    for (int i = 0; i < helpers; i++) pool.Schedule([work] { work->drain(); });
-  }
-  // Nothing waits for helpers, who may come late or never: this thread makes all blocks that none
-  // has taken, and XLA goes on once the last is made.
-  work->drain();
-  return future;
+  const Sizes sizes{m, n, k, left_t, right_t};
+  const Work work{sizes, left.typed_data(), right.typed_data(), out->typed_data(),
+                  (n + kWidth - 1) / kWidth, sizes.kernel(kWidth), sizes.kernel(n % kWidth)};
+  const bool shared = 2.0 * pair * m * n * k >= kShared;
+  return MakeAll(pool, shared, pair * work.blocks, [work](int index) { work.block(index); });
 }
 
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(product, Product,
-                              ffi::Ffi::Bind()
-                                  .Ctx<ffi::ThreadPool>()
-                                  .Attr<bool>("left_t")
-                                  .Attr<bool>("right_t")
-                                  .Arg<ffi::Buffer<ffi::F32>>()
-                                  .Arg<ffi::Buffer<ffi::F32>>()
-                                  .Ret<ffi::Buffer<ffi::F32>>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(product, Product, Signature<ffi::F32>());
 
 // Whether libxsmm makes a product on this processor; asked before XLA is told to call the above.
 extern "C" bool fits(int m, int n, int k, bool left_t, bool right_t) {

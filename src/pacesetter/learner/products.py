@@ -28,6 +28,7 @@ R = TypeVar("R")
 Way = Literal["libxsmm", "onednn", "xla"]
 VARIABLE = "PACESETTER_PRODUCTS"
 LEAST = 16  # products with a side below it stay XLA's
+USUAL = (256, 256, 256)  # the product of which a processor must know how to make it
 
 
 class Library(NamedTuple):
@@ -69,7 +70,8 @@ def of(hyper: Any) -> Way:
 def notes(hyper: Any) -> list[str]:
     """What a person should know of it: a line if a library is asked for by name and absent."""
     return [
-        f"{VARIABLE}: {name} is not built in, so XLA makes all products; see docs/products.md"
+        f"{VARIABLE}: {name} is not built in, or not for this processor, so XLA makes all "
+        "products; see docs/products.md"
         for name, library in LIBRARIES.items()
         if os.environ.get(VARIABLE) == name
         and library.precision == _precision(hyper)
@@ -98,7 +100,7 @@ def by_library(function: Callable[P, R], precision: str) -> Callable[P, R]:
 
 @cache
 def loaded(name: Way) -> Any:
-    """The compiled products, made known to XLA; None where there are none that it can use."""
+    """The compiled products, made known to XLA; None where this processor has none to use."""
     library = LIBRARIES[name]
     for needed in library.needs:
         with suppress(OSError):
@@ -112,7 +114,7 @@ def loaded(name: Way) -> Any:
         )
     except (OSError, AttributeError, jax.errors.JaxRuntimeError):
         return None
-    return found
+    return found if found.fits(*USUAL, False, False) else None
 
 
 def _product_by(made_by: Way, equation: JaxprEqn, inputs: list[Any]) -> Any:
