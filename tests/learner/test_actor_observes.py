@@ -217,6 +217,7 @@ def test_numbers_that_there_are_not(words: str) -> None:
         ("td3 --actor-observes 0:4", "actor_observes: 0:4 is not among the 3 numbers 0:3"),
         ("td3 --actor-observes speed", "actor_observes: is no list of numbers and ranges"),
         ("td3 --actor-observes 0:2:1", "actor_observes: is no list of numbers and ranges"),
+        (f"td3 --actor-observes {'9' * 5_000}", "actor_observes: is no list of numbers"),
         ("td7 --actor-observes 0:2", "actor_observes: TD7 cannot hide anything from its actor"),
         (
             "td3 --actor-observes 0:2 --actor-layer-norm --exploration parameter",

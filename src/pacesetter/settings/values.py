@@ -31,7 +31,8 @@ def _duration(value: object) -> object:
 
 
 def _numbers(words: str) -> str:
-    each = r"(-?\d+|(-?\d+)?:(-?\d+)?)"
+    number = r"-?[0-9]{1,9}"
+    each = f"({number}|({number})?:({number})?)"
     if not re.fullmatch(f"{each}(,{each})*", words):
         raise ValueError("is no list of numbers and ranges; write 0:17, :-4 or 0:8,12")
     return words
