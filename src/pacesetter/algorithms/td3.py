@@ -18,7 +18,7 @@ import optax
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
-from pacesetter.algorithms.contract import Array, Update, each_minibatch
+from pacesetter.algorithms.contract import Array, Update, each_minibatch, last_minibatch
 from pacesetter.algorithms.deterministic import DeterministicLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import critic_heads, mlp
@@ -99,7 +99,7 @@ class TD3(DeterministicLearner):
     def update(self, state: State, batch: Batch, key: Array) -> Update:
         keys = jax.random.split(key, self.hyper.policy_delay + 1)
         state, (losses, td_error) = each_minibatch(self.critic_step, state, batch, keys[:-1])
-        last = jax.tree.map(lambda x: x[-1], batch)
+        last = last_minibatch(batch)
         state, actor_loss = self.fit_actor(state, last)
         losses = {name: loss.mean() for name, loss in losses.items()} | {"actor_loss": actor_loss}
         if self.exploration.adapts:
