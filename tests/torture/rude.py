@@ -164,11 +164,17 @@ class Trial:
         return ""
 
     def _wait(self) -> list[int]:
-        """Processes of this trial that are there after some seconds."""
+        """Processes of this trial that are there after some seconds.
+
+        One that was killed has no environment any more when the system comes to close its files.
+        """
         end = time.monotonic() + GONE
-        while (left := self._left()) and time.monotonic() < end:
+        while ((left := self._left()) or self._holds_a_run()) and time.monotonic() < end:
             time.sleep(0.1)
         return left
+
+    def _holds_a_run(self) -> bool:
+        return any(run.in_use() for run in find_all(self.folder))
 
     def _left(self) -> list[int]:
         mark = f"{MARK}={self.folder}".encode()
