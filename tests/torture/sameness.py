@@ -18,9 +18,9 @@ from pacesetter.runs import RunDirectory
 
 THREADS = 2
 OTHERS = (1, 3, 4)
-HALF, WHOLE = "600", "1200"
+HALF, WHOLE = "1000", "1500"  # a run that ends logs how training went, others each 1,000 steps
 WORDS = "train multi-td3 Hopper-v5 --hidden 128 128 --batch-size 128 --warmup 100 -q"
-WORDS += f" --eval-every {HALF} --eval-episodes 1 --checkpoint-every 0.5s"
+WORDS += " --eval-every 500 --eval-episodes 1 --checkpoint-every 0.5s"
 EACH = 6  # trials, of which the last is of another number of threads
 MOST = 4  # processes of the load
 LOAD = """
