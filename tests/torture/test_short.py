@@ -26,9 +26,9 @@ from attempts import Tally, attempt, command
     "ignore:invalid value encountered in matmul:RuntimeWarning",
 )
 def test_odd_files(tmp_path: Path) -> None:
-    tally = odd_files.run(tmp_path, odd_files.KINDS, each=12, seed=5)
+    tally = odd_files.run(tmp_path, odd_files.KINDS, each=8, seed=5)
     assert tally.wrong == []
-    assert tally.made == 12 * len(odd_files.KINDS)
+    assert tally.made == 8 * len(odd_files.KINDS)
     assert tally.refused > tally.made / 4
 
 
@@ -41,9 +41,9 @@ def test_configurations(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("default")
 def test_files_that_are_no_longer_what_they_were(tmp_path: Path) -> None:
-    tally = swapped.run(tmp_path, 25, seed=5)
+    tally = swapped.run(tmp_path, 15, seed=5)
     assert tally.wrong == []
-    assert 0 < tally.refused < tally.made == 25
+    assert 0 < tally.refused < tally.made == 15
 
 
 def test_a_signal_at_any_moment(tmp_path: Path) -> None:
@@ -56,8 +56,8 @@ def test_a_number_that_is_none(tmp_path: Path) -> None:
 
 
 def test_many_want_one_run(tmp_path: Path) -> None:
-    tally = crowds.run(tmp_path, 2, seed=5, size=4)
-    assert (tally.made, tally.wrong) == (2, [])
+    tally = crowds.run(tmp_path, 1, seed=5, size=4)
+    assert (tally.made, tally.wrong) == (1, [])
 
 
 def test_a_full_disk(tmp_path: Path) -> None:
@@ -67,8 +67,8 @@ def test_a_full_disk(tmp_path: Path) -> None:
 
 
 def test_what_was_not_synced_is_lost(tmp_path: Path) -> None:
-    tally = power_cuts.run(tmp_path, 8, seed=5)
-    assert (tally.made, tally.wrong) == (8, [])
+    tally = power_cuts.run(tmp_path, 5, seed=5)
+    assert (tally.made, tally.wrong) == (5, [])
 
 
 @pytest.mark.parametrize("way", ["ExitsInC", "Prints"])
