@@ -1,6 +1,6 @@
 """Run the experiments and write what came out into the table of docs/reliability.md.
 
-`python tests/torture/run.py` takes minutes, with `--long` an hour; `make torture` calls it. Names
+`python tests/torture/run.py` takes minutes, with `--long` hours; `make torture` calls it. Names
 of experiments run these alone, and the other rows of the table stay. Each is a process of its own.
 """
 
@@ -38,7 +38,7 @@ PAGE = ROOT / "docs" / "reliability.md"
 
 
 class Experiment(NamedTuple):
-    """What is done, what must come out, and how often it is done for minutes and for an hour."""
+    """What is done, what must come out, and how often it is done in short and at length."""
 
     name: str
     what: str
