@@ -1,8 +1,10 @@
 """Build products by libxsmm and oneDNN (docs/products.md), where they and g++ are; else nothing."""
 
+import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,7 +55,9 @@ class BuildHook(BuildHookInterface):
         built = [each.built for each in SOURCES if build(Path(self.root), each)]
         build_data["artifacts"] += built
         if built:
-            build_data.update(pure_python=False, infer_tag=True)
+            # Nothing in them knows Python, so one wheel serves every version of it.
+            platform = re.sub("[-.]", "_", sysconfig.get_platform())
+            build_data.update(pure_python=False, tag=f"py3-none-{platform}")
 
 
 def can_link(source: Source) -> bool:
