@@ -62,7 +62,7 @@ def refuse_to_see(policy: Policy, observations: Floats) -> None:
         assert not np.allclose(policy(changed(observations, number)), actions, atol=1e-4)
 
 
-SLOW = ("ddpg", "tqc", "sunrise-td3", "steve", "steve-td3")
+SLOW = ("ddpg", "tqc", "crossq", "sunrise", "sunrise-td3", "steve", "steve-td3")
 
 
 @pytest.mark.parametrize(
