@@ -84,7 +84,9 @@ def signals(folder: Path, count: int, seed: int = 0) -> Tally:
         tally.slowest = max(tally.slowest, time.monotonic() - began)
         if not begun:
             tally.values["early"] = tally.values.get("early", 0) + 1
-            fault = "" if process.returncode and not runs.exists() else "it has begun all the same"
+            # Python ends by the signal, or while it starts up by a traceback of its own.
+            by_signal = process.returncode in (-sent, CODES[sent]) or "KeyboardInterrupt" in err
+            fault = "" if by_signal and not runs.exists() else f"exit {process.returncode}: {err!r}"
         else:
             fault = _fault(process.returncode, sent, err, runs)
         if fault:
