@@ -13,7 +13,7 @@ BIN := .venv/bin
 	touch $@
 
 .venv/peers: .venv/tested
-	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
+	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0 'rltools[mkl]'
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[peers]'
 	touch $@
 
@@ -50,6 +50,7 @@ wheel: .venv/installed
 
 bench-speed: .venv/peers
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/race.py --rounds 1 --steps 1000
 	NPROC=1 taskset -c 0 $(BIN)/python benchmarks/ceiling.py
 	$(BIN)/python benchmarks/ceiling.py
 	$(BIN)/python benchmarks/ceiling.py --members 2

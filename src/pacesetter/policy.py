@@ -60,13 +60,17 @@ class Policy:
     about: dict[str, Any] = field(default_factory=dict)
     shapes: tuple[Shape, Shape] | None = None  # the env's own, of observations and actions
 
+    @property
+    def sizes(self) -> list[int]:
+        """Of an actor: the observation, each hidden layer, the action."""
+        layers = self.actors[0]
+        return [layers[0]["kernel"].shape[0], *(layer["kernel"].shape[1] for layer in layers)]
+
     def __repr__(self) -> str:
-        sizes = [self.actors[0][0]["kernel"].shape[0]]
-        sizes += [layer["kernel"].shape[1] for layer in self.actors[0]]
         about = [str(self.about[key]) for key in ("env", "algorithm") if key in self.about]
         about += [f"step {self.about['step']:,}"] if "step" in self.about else []
         several = [f"mean of {len(self.actors)} actors"] if len(self.actors) > 1 else []
-        return f"Policy({', '.join([*about, *several, ' -> '.join(map(str, sizes))])})"
+        return f"Policy({', '.join([*about, *several, ' -> '.join(map(str, self.sizes))])})"
 
     def __call__(self, observation: Any) -> Floats:
         """Action in the env's units and shape, clipped to its bounds."""

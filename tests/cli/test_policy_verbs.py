@@ -1,6 +1,7 @@
 """The verbs that take a policy: which one a word means, and what they hand to `media`."""
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -81,6 +82,20 @@ def test_champions_are_listed_and_loaded(capsys: pytest.CaptureFixture[str]) -> 
     assert found["mean"] > 5_000
     assert load(found["policy"]).about["algorithm"] == "sac"
     assert CHAMPION in refused(capsys, "eval", "champion:HalfCheetah-v4-td3")
+
+
+def test_show_tells_what_a_policy_file_says_of_itself(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A shipped champion, and a file beside; a bad name and no file are refused in a line."""
+    assert main(["show", f"champion:{CHAMPION}", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["about"]["env"], told["sizes"]) == ("HalfCheetah-v4", [17, 256, 256, 6])
+    untrained("Pendulum-v1").save(here / "mine.safetensors")
+    assert main(["show", "mine.safetensors"]) == 0
+    assert re.search(r"^env +Pendulum-v1$", capsys.readouterr().out, re.MULTILINE)
+    assert CHAMPION in refused(capsys, "show", "champion:HalfCheetah-v4-td3")
+    assert "no such file" in refused(capsys, "show", "none.safetensors")
 
 
 @pytest.mark.slow

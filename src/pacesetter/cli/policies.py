@@ -90,14 +90,17 @@ def _wrap(about: dict[str, Any], env: str | None, given: Namespace) -> tuple[str
     return tuple(given.wrap or own)
 
 
+def is_file(run: str) -> bool:
+    """Whether a policy file is meant, or a shipped champion, and no run."""
+    return run.startswith(CHAMPION) or Path(run).suffix == ".safetensors"
+
+
 def policy_file(run: str, runs: str) -> Path:
     """The policy file that is meant."""
     from pacesetter.runs import find
 
-    if run.startswith(CHAMPION):
-        return champion(run.removeprefix(CHAMPION))
-    if Path(run).suffix == ".safetensors":
-        return Path(run)
+    if is_file(run):
+        return champion(run.removeprefix(CHAMPION)) if run.startswith(CHAMPION) else Path(run)
     found = find(run, runs)
     if not present(found.policy_file):
         raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")

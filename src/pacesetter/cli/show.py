@@ -1,10 +1,13 @@
-"""The verb `show`: where a run stands, what it scored and spent, its settings and versions."""
+"""The verb `show`: where a run stands, what it scored and spent, its settings and versions; or
+what a policy file says of itself."""
 
+from pathlib import Path
 from typing import Any
 
 from tabulate import tabulate
 
 from pacesetter.cli.flags import parser
+from pacesetter.cli.policies import RUN, is_file, policy_file
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
 from pacesetter.settings.budget import budget, is_spent, standing
@@ -19,13 +22,19 @@ MADE = ("command", "commit", "threads", "machine")
 
 def show(words: list[str]) -> int:
     """Show a run: how far it is, how it scores, what it spent, its settings."""
-    command = parser("show", "Show a run: how far it is, how it scores, what it spent.")
-    command.add_argument("run", metavar="RUN", help="run folder, or the end of its path")
+    command = parser(
+        "show", "Show a run: how far it is, how it scores, what it spent; or a policy file."
+    )
+    command.add_argument("run", metavar="RUN|FILE", help=RUN)
     about = f"show every evaluation (default the last {SHOWN})"
     command.add_argument("--all", action="store_true", help=about)
     command.add_argument("--json", action="store_true", help="print everything as a JSON object")
     command.add_runs()
     found = command.parse(words)
+    if is_file(found.run):
+        told = tell_policy(policy_file(found.run, found.runs))
+        print(as_json(told) if found.json else _policy_text(told))
+        return 0
     run = find(found.run, found.runs)
     try:
         told = tell(run)
@@ -52,6 +61,22 @@ def tell(run: RunDirectory) -> Row:
         "settings": record["settings"],
         "made": made | {"products": record.get("products") or "xla"},
         "versions": record.get("versions", {}),
+    }
+
+
+def tell_policy(file: Path) -> Row:
+    """All that a policy file says of itself, as plain values."""
+    from pacesetter.policy import load
+
+    policy = load(file)
+    return {
+        "name": str(file),
+        "actors": len(policy.actors),
+        "sizes": policy.sizes,
+        "normalizes": policy.normalizer is not None,
+        "low": [float(x) for x in policy.low],
+        "high": [float(x) for x in policy.high],
+        "about": policy.about,
     }
 
 
@@ -91,6 +116,14 @@ def _text(told: Row, most: int | None) -> str:
         _table([*told["made"].items(), *told["versions"].items()]),
     ]
     return "\n\n".join(parts)
+
+
+def _policy_text(told: Row) -> str:
+    about = {key: value for key, value in told["about"].items() if key != "versions"}
+    own = {key: told[key] for key in ("actors", "sizes", "normalizes", "low", "high")}
+    versions = told["about"].get("versions", {})
+    tables = (list(table.items()) for table in (about, own, versions))
+    return "\n\n".join([told["name"], *(_table(table) for table in tables)])
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> str:
