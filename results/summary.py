@@ -40,8 +40,10 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "models": [{"budget": "30k"}, {"budget": "50k"}, {"cpu": "410s"}],
     "imagined": [{"budget": "45k"}],
     "precision": [{"budget": "100k"}, {"budget": "200k"}],
+    "onednn": [{"budget": "100k", "reference": "td3-onednn"}],
     "walkers": [{"budget": "30k"}],
     "champions": [{"budget": "100k", "reference": "crossq-small"}],
+    "humanoid": [{"budget": "776k", "reference": "multi-td3"}],
 }
 
 
