@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -91,7 +92,8 @@ def test_show_tells_what_a_policy_file_says_of_itself(
     assert main(["show", f"champion:{CHAMPION}", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["about"]["env"], told["sizes"]) == ("HalfCheetah-v4", [17, 256, 256, 6])
-    untrained("Pendulum-v1").save(here / "mine.safetensors")
+    mine = untrained("Pendulum-v1")
+    replace(mine, about=mine.about | {"versions": "odd"}).save(here / "mine.safetensors")
     assert main(["show", "mine.safetensors"]) == 0
     assert re.search(r"^env +Pendulum-v1$", capsys.readouterr().out, re.MULTILINE)
     assert CHAMPION in refused(capsys, "show", "champion:HalfCheetah-v4-td3")

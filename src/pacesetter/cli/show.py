@@ -119,11 +119,12 @@ def _text(told: Row, most: int | None) -> str:
 
 
 def _policy_text(told: Row) -> str:
-    about = {key: value for key, value in told["about"].items() if key != "versions"}
+    versions = told["about"].get("versions")
+    apart = isinstance(versions, dict)  # a file may say anything
+    about = {key: x for key, x in told["about"].items() if not (apart and key == "versions")}
     own = {key: told[key] for key in ("actors", "sizes", "normalizes", "low", "high")}
-    versions = told["about"].get("versions", {})
-    tables = (list(table.items()) for table in (about, own, versions))
-    return "\n\n".join([told["name"], *(_table(table) for table in tables)])
+    tables = (list(table.items()) for table in (about, own, versions if apart else {}))
+    return "\n\n".join([told["name"], *(_table(table) for table in tables if table)])
 
 
 def _table(rows: list[Any], headers: tuple[str, ...] = ()) -> str:
