@@ -120,7 +120,10 @@ def cases(base: Base) -> dict[str, Case]:
         "policy.safetensors": (
             run.policy_file,
             mutations.tensors,
-            [command("eval", run.policy_file, "--episodes", 1)],
+            [
+                command("eval", run.policy_file, "--episodes", 1),
+                command("show", run.policy_file),
+            ],
         ),
         "settings.toml": (
             settings,
