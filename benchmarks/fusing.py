@@ -10,11 +10,11 @@ the product. A call that made both at once would save at most that.
 import argparse
 from collections.abc import Callable
 from functools import partial
-from time import perf_counter
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from ceiling import timed
 from jax.lax import rsqrt
 from tabulate import tabulate
 
@@ -23,6 +23,7 @@ from pacesetter.learner.products import by_library, way
 
 UNITS, LAYERS, NETWORKS = 256, 4, 2
 BATCHES = (64, 128, 256)
+REPEATS = 20
 ADDED = ("products", "+ bias", "+ ReLU", "+ layer norm")
 
 
@@ -50,15 +51,6 @@ def gradient(added: int, precision: str) -> Callable[[Any, Any], Any]:
     return jax.jit(by_library(rounded, precision))
 
 
-def microseconds(call: Callable[[], Any], repeats: int = 20) -> float:
-    """Per call."""
-    began = perf_counter()
-    for _ in range(repeats):
-        found = call()
-    jax.block_until_ready(found)
-    return (perf_counter() - began) / repeats * 1e6
-
-
 def main() -> None:
     """Print the table; the ways take turns, and the best of their repeats counts."""
     parser = argparse.ArgumentParser(description="Time what stands beside the products.")
@@ -77,7 +69,7 @@ def main() -> None:
         calls = [partial(way, x, weights) for way in ways]
         for call in calls:
             jax.block_until_ready(call())
-        rounds = [[microseconds(call) for call in calls] for _ in range(chosen.rounds)]
+        rounds = [[1e6 * timed(call, REPEATS) for call in calls] for _ in range(chosen.rounds)]
         columns.append([min(of_one) for of_one in zip(*rounds, strict=True)])
     rows = [
         [name, *(f"{column[i]:.0f} ({column[i] / column[0]:.2f})" for column in columns)]

@@ -99,8 +99,10 @@ def policy_file(run: str, runs: str) -> Path:
     """The policy file that is meant."""
     from pacesetter.runs import find
 
+    if run.startswith(CHAMPION):
+        return champion(run.removeprefix(CHAMPION))
     if is_file(run):
-        return champion(run.removeprefix(CHAMPION)) if run.startswith(CHAMPION) else Path(run)
+        return Path(run)
     found = find(run, runs)
     if not present(found.policy_file):
         raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")
