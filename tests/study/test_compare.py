@@ -246,6 +246,19 @@ def test_other_settings_under_one_name_are_refused(tmp_path: Path) -> None:
     assert "batch_size" in compare([tmp_path], mixed=True).notes[0]
 
 
+@pytest.mark.parametrize(("key", "given"), [("select_window", 5), ("select_after", 3_000)])
+def test_a_default_and_its_value_spelled_out_are_one_setting(
+    tmp_path: Path, key: str, given: int
+) -> None:
+    same = {"rule": "rescue", "warmup": 3_000}
+    small(tmp_path, seed=0, **same, **{key: None})
+    small(tmp_path, seed=1, **same, **{key: given})
+    assert len(compare([tmp_path]).runs) == 2
+    small(tmp_path, seed=2, **same, **{key: given + 1})
+    with pytest.raises(UsageError, match=f"td3 has {key} {given} and {given + 1}"):
+        compare([tmp_path])
+
+
 def test_the_same_seed_twice_is_refused(tmp_path: Path) -> None:
     small(tmp_path / "a")
     small(tmp_path / "b")

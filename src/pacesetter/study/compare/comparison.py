@@ -11,7 +11,9 @@ from pydantic.dataclasses import dataclass as checked
 
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import FREE_PER_SEED
+from pacesetter.runs.log import Row
 from pacesetter.settings import STRICT
+from pacesetter.settings.ensemble import WINDOWS
 from pacesetter.settings.validation import build
 from pacesetter.settings.values import Count, Duration
 from pacesetter.study.compare import stats
@@ -140,10 +142,19 @@ def _differing(runs: list[Run]) -> list[str]:
         other = first.setdefault((run.env, run.name), run)
         # A setting that an older version did not have is not a difference.
         for key in sorted((run.settings.keys() & other.settings.keys()) - _FREE):
-            a, b = other.settings[key], run.settings[key]
+            a, b = _in_force(other.settings, key), _in_force(run.settings, key)
             if a != b:
                 faults[run.env, run.name, key] = f"{run.env} {run.name} has {key} {a} and {b}"
     return list(faults.values())
+
+
+def _in_force(settings: Row, key: str) -> Any:
+    """The value of a setting; for None, the default that other settings give it."""
+    if settings[key] is None and key == "select_window":
+        return WINDOWS.get(settings.get("rule", ""), 1)
+    if settings[key] is None and key == "select_after":
+        return settings.get("warmup")
+    return settings[key]
 
 
 def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
