@@ -120,7 +120,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
 
     An id without a version is of Gymnasium's newest.
     """
-    env = _full_id(env)
+    env = full_id(env)
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper
     merged: Settings = {"name": name.replace(":", "-")}
@@ -153,12 +153,13 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     return Config(run, hyper)
 
 
-def _full_id(env: str) -> str:
+def full_id(env: str) -> str:
+    """The id, with Gymnasium's newest version if it has none."""
     if ":" in env or re.search(r"-v\d+$", env):
         return env
-    from pacesetter.envs.ids import full_id
+    from pacesetter.envs import ids
 
-    return full_id(env)
+    return ids.full_id(env)
 
 
 def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
@@ -177,10 +178,16 @@ def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
             f"update_every: blocks of {hyper.block} steps and updates at an episode's end "
             "(--update-at episode, --assess) would rarely coincide; choose one"
         )
-    if hyper.block > run.steps:
+    own = budget.budget(vars(run)) // run.members
+    if hyper.block > own:
         raise UsageError(
-            f"update_every: a run of {run.steps} steps ends before the first block of "
-            f"{hyper.block} and would never learn; at most {run.steps}"
+            f"update_every: a run of {own} steps per member ends before the first block of "
+            f"{hyper.block} and would never learn; at most {own}"
+        )
+    if hyper.lr_end != 1 and run.select_on == "eval" and run.count_selection_steps:
+        raise UsageError(
+            "lr_end: falls with updates over --steps, but --select-on eval takes a share of the "
+            "steps that is not known beforehand; add --no-count-selection-steps"
         )
     if hyper.assess and hyper.warmup_updates:
         raise UsageError(

@@ -10,6 +10,7 @@ import numpy as np
 from pacesetter.consent import require
 from pacesetter.envs import Environment, Recipe
 from pacesetter.envs.border import reward_terms
+from pacesetter.envs.ids import full_id
 from pacesetter.errors import UsageError
 from pacesetter.policy import Policy
 from pacesetter.seeding import Stream, generator
@@ -110,7 +111,7 @@ def enter(
 
 def _recipe(about: dict[str, Any], env: str | None, env_kwargs: dict[str, Any] | None) -> Recipe:
     """The task by its id, with what the policy's file says of it if it is the policy's own."""
-    name = env or about.get("env")
+    name = full_id(env) if isinstance(env, str) else env or about.get("env")
     if name is not None and not isinstance(name, str):
         raise UsageError(f"env: must be an id such as HalfCheetah-v5, got a {type(name).__name__}")
     if name is None:

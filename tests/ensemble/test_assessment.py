@@ -126,3 +126,28 @@ def test_many_updates_are_spread_over_ticks(runs: Path, monkeypatch: pytest.Monk
     again = assessed(runs, ([5, 4, 3],), steps=61, name="again", eval_every=1000)
     run_to_end(again)
     assert same(*(jax.device_get(t.loop.learners.states[0]) for t in (spread, again)))
+
+
+def test_an_episode_that_another_policy_began_assesses_nobody(runs: Path) -> None:
+    """Member 0 becomes a copy in the middle of its second episode; the third counts again."""
+    trainer = assessed(runs, ([5], [4]), members=2, rule="none", assess=1, steps=120, **IDLE)
+    for tick in range(30):
+        if tick == 15:
+            trainer.progress.members[0].copied = trainer.progress.step
+        trainer.loop.tick()
+    found = trainer.loop.training_values()["assessed"]
+    trainer.close()
+    assert [k for k, _ in found] == [0, 1, 1, 0, 1]
+
+
+def test_a_mean_of_states_has_played_no_episode_yet(runs: Path) -> None:
+    trainer = assessed(runs, ([5], [4]), members=2, rule="none", assess=3, steps=120, **IDLE)
+    for _ in range(20):
+        trainer.loop.tick()
+    checkpoints, parents = trainer.loop.policy_checkpoints, np.array([0, 0])
+    assert [each.returns for each in checkpoints.assessments] == [[5, 5], [4, 4]]
+    checkpoints.copy(parents, averaged=False)
+    assert [each.returns for each in checkpoints.assessments] == [[5, 5], [5, 5]]
+    checkpoints.copy(parents, averaged=True)
+    assert [each.returns for each in checkpoints.assessments] == [[], []]
+    trainer.close()

@@ -7,6 +7,7 @@ import pytest
 from scripted_runs import IDLE, start
 from short_runs import TINY, log, run_to_end
 
+from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.training.trainer import Trainer
 
@@ -70,3 +71,48 @@ def test_refuses_numbers_out_of_range(runs: Path, envs: int) -> None:
 def test_refuses_assessed_policies(runs: Path) -> None:
     with pytest.raises(UsageError, match=r"num_envs: --assess judges .*; use --num-envs 1"):
         Trainer("td3", "Pendulum-v1", runs=runs, num_envs=2, assess=1, **TINY)
+
+
+def test_a_round_counts_whole_not_by_its_longest_episodes(runs: Path) -> None:
+    """The last episode of member 0 is its longest and worst; by its mean, 4 against 3, it wins."""
+    returns = ([1], [2], [7], [4])
+    trainer = start(runs, returns, (20, 10, 10, 10), num_envs=2, steps=80, **IDLE)
+    row = next(row for row in log(run_to_end(trainer)) if row["kind"] == "select")
+    assert (row["returns"], row["parents"]) == ([[7, 1], [2, 4]], [0, 0])
+
+
+def calls(trainer: Trainer) -> list[int]:
+    """The steps that member 0 had made at each of its calls of the update."""
+    found: list[int] = []
+    make = trainer.loop.updates.make
+
+    def watched(members: list[int]) -> None:
+        found.extend(trainer.progress.members[0].steps for k in members if k == 0)
+        make(members)
+
+    trainer.loop.updates.make = watched
+    run_to_end(trainer)
+    return sorted(set(found))
+
+
+def test_envs_that_wait_do_not_fill_a_block(runs: Path) -> None:
+    """Blocks of 20 steps, in rounds of 43: 2 per tick, then 1 while the shorter env waits."""
+    trainer = start(
+        runs, ([1], [2], [3], [4]), (30, 30, 13, 30), num_envs=2, steps=240, update_every=20,
+        batch_size=4,
+    )  # fmt: skip
+    assert calls(trainer) == [20, 40, 61, 80, 100]
+
+
+def test_updates_at_the_end_of_an_episode_are_made_once_per_end(runs: Path) -> None:
+    """Env 0 waits from step 20 to step 30 of its member's other env."""
+    trainer = start(
+        runs, ([1], [2], [3], [4]), (10, 20, 20, 20), num_envs=2, steps=120, batch_size=4,
+        update_at="episode",
+    )  # fmt: skip
+    assert calls(trainer) == [20, 30, 50]
+
+
+def test_refuses_blocks_that_no_member_fills() -> None:
+    with pytest.raises(UsageError, match=r"update_every: .* 250 steps per member .* at most 250"):
+        resolve("multi-td3", "Ant-v5", {"members": 4, "steps": 1000, "update_every": 500})

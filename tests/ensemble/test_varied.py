@@ -237,3 +237,8 @@ def test_settings_of_a_stopped_run_go_on(runs: Path) -> None:
     assert [member.scales for member in resumed.progress.members] == before
     assert before[0] != before[1]
     resumed.close()
+
+
+def test_refuses_gammas_whose_returns_leave_the_bins() -> None:
+    with pytest.raises(UsageError, match="vary: gamma cannot differ with --bins"):
+        resolve("crossq-bins", "Pendulum-v1", {"members": 2, "vary": {"gamma": (0.98, 0.99)}})

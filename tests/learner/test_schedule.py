@@ -61,3 +61,10 @@ def test_one_is_the_run_without_a_schedule(runs: Path) -> None:
 def test_refuses_a_horizon_without_an_end(runs: Path) -> None:
     with pytest.raises(UsageError, match="lr_horizon: needs --lr-end below 1"):
         Trainer("td3", "Pendulum-v1", runs=runs, lr_horizon=100, **TINY)
+
+
+def test_refuses_a_schedule_over_steps_that_selection_takes() -> None:
+    layers = {"lr_end": 0.1, "select_on": "eval"}
+    with pytest.raises(UsageError, match=r"lr_end: .*add --no-count-selection-steps"):
+        resolve("multi-td3", "Pendulum-v1", layers)
+    resolve("multi-td3", "Pendulum-v1", layers | {"count_selection_steps": False})

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from policies import untrained
 
+from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media.hub import load_from_hub, push
@@ -153,3 +154,25 @@ def test_missing_extra_is_one_line(file: Path, monkeypatch: pytest.MonkeyPatch) 
     for call in (lambda: push(file, "a/b"), lambda: load_from_hub("a/b")):
         with pytest.raises(UsageError, match=r"pip install 'pacesetter\[hub\]'"):
             call()
+
+
+def test_card_of_a_file_with_odd_words(folder: Path, tmp_path: Path) -> None:
+    odd = untrained("Pendulum-v1", algorithm="td3", score=None, versions=["jax"], step=5)
+    odd.save(tmp_path / "odd.safetensors")
+    push(tmp_path / "odd.safetensors", "someone/odd", episodes=1)
+    text = (folder / "someone" / "odd" / "README.md").read_text()
+    assert "return in training" not in text
+
+
+def test_verb_plays_the_wrapped_task_and_no_other(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "odd_envs:Doubled"
+    untrained("Pendulum-v1", algorithm="td3", step=5, wrap=[name]).save(
+        tmp_path / "half.safetensors"
+    )
+    words = ["push", str(tmp_path / "half.safetensors"), "someone/half", "--episodes", "1"]
+    assert main([*words, "--allow", name]) == 0
+    assert (folder / "someone" / "half" / "README.md").exists()
+    assert main([*words, "--wrap", "odd_envs:Raised", "--allow", name]) == 2
+    assert "wrap: the card tells of the task" in capsys.readouterr().err

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from policies import untrained
 
+from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
 from pacesetter.media.export import export
 from pacesetter.media.sb3 import SB3Policy
@@ -118,3 +119,12 @@ def test_a_policy_file_cannot_put_code_into_the_script(tmp_path: Path) -> None:
     hostile.about["env"] = "os:Pendulum-v1"
     with pytest.raises(UsageError, match="allow it with --allow"):
         export(hostile, "sb3", tmp_path / "two.py")
+
+
+def test_script_makes_the_task_that_was_asked_for(pendulum: Policy, tmp_path: Path) -> None:
+    path = tmp_path / "pendulum.py"
+    export(pendulum, "sb3", path, env="Pendulum-v1", env_kwargs={"g": 1.0})
+    assert "'Pendulum-v1', **{'g': 1.0}" in path.read_text()
+    wrapped = Recipe("Pendulum-v1", {}, ("my_mod:Half",))
+    with pytest.raises(UsageError, match="wrap: the script makes the plain task, without my_mod"):
+        export(pendulum, "sb3", tmp_path / "other.py", env=wrapped)

@@ -405,3 +405,18 @@ def test_horizon_is_set_at_the_start(runs: Path) -> None:
     values = content(trainer.directory)["arrays"]["replay.0.values"]
     assert values.shape == (400,)
     assert len(np.unique(values)) > 10
+
+
+def test_equal_returns_that_leave_together_all_leave_the_ranking() -> None:
+    """Ten short episodes of return 0 are pushed out by one long one of return 1, again and again;
+    a checkpoint in which some of them were left heals.
+    """
+    sampler = ByReturn(20, 0.6, 0.0, to_go=False)
+    for _ in range(5):
+        episodes(sampler, [0.0] * 10, length=1)
+        window = episodes(sampler, [1.0], length=20)
+    assert sampler.ranking.tolist() == [total for total, _ in sampler.ended] == [1.0]
+    np.testing.assert_allclose(shares(sampler, window), 0.55**0.6)
+    stale = sampler.arrays(window) | {"ranking": np.array([0.0, 0.0, 1.0])}
+    sampler.restore(stale, window)
+    assert sampler.ranking.tolist() == [1.0]

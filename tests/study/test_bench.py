@@ -945,3 +945,10 @@ def test_what_a_crashed_run_leaves_running_is_ended(
         assert time.monotonic() < end
         time.sleep(0.01)
     assert outcome.code == 0
+
+
+def test_settings_of_a_task_hold_for_its_id_without_a_version(here: Path) -> None:
+    text = '[entries.td3]\n[entries.td3.env."Pendulum-*"]\nsteps = 3_000\n'
+    (here / "short.toml").write_text(text)
+    (job,) = expand(load("short.toml"), {"envs": ["Pendulum", "Pendulum-v1"]}, "runs")
+    assert (job.config.run.env, job.config.run.steps) == ("Pendulum-v1", 3_000)

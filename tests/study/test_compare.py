@@ -668,3 +668,36 @@ def test_a_file_that_cannot_be_written_leaves_the_one_before(
     assert main(["compare", "td3", "-o", str(file)]) == 2
     assert file.read_bytes() == b"of yesterday"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["runs", file.name]
+
+
+def test_a_wrapped_task_is_another_task(tmp_path: Path) -> None:
+    small(tmp_path, name="td3")
+    small(tmp_path, name="sac", wrap=["my_mod:Half"])
+    found = compare([tmp_path])
+    assert found.envs == ["Ant-v5", "Ant-v5 wrap=my_mod:Half"]
+    assert not found.find("Ant-v5", "sac")
+
+
+def test_the_same_seed_twice_is_refused_whatever_it_cost(tmp_path: Path) -> None:
+    """Two machines of other speeds stand at other steps after the same time."""
+    small(tmp_path, seed=0)
+    make_run(tmp_path / "slow", "Ant-v5", "td3", 0, budget=40_000, evaluations=20)
+    for more in ({"cpu": "1s"}, {"mixed": True}):
+        with pytest.raises(UsageError, match="both Ant-v5 td3 seed 0"):
+            compare([tmp_path], **more)
+
+
+def test_a_limit_below_the_first_evaluation_leaves_nothing(tmp_path: Path) -> None:
+    log = small(tmp_path) / "metrics.jsonl"
+    dear = log.read_text().replace('"cpu_seconds": 0.0,', '"cpu_seconds": 1.0,')
+    log.write_text(dear)
+    with pytest.raises(UsageError, match="no evaluation up to"):
+        compare([tmp_path], cpu="0.5s")
+
+
+def test_best_of_two_halves_needs_an_evaluation_at_half(tmp_path: Path) -> None:
+    """Of 50,000 steps with an evaluation every 20,000 no half was evaluated."""
+    for seed in range(3):
+        make_run(tmp_path, "Ant-v5", "td3", seed, budget=100_000, evaluations=5)
+    row = contrasts.best_of_two(compare([tmp_path]))[0].rows[0]
+    assert row[4].text == "-"

@@ -44,3 +44,21 @@ def test_several_tasks_are_counted_against_the_control(tmp_path: Path) -> None:
     without = headline(compare([tmp_path], reference="ddpg"))
     assert "sac on 2" in without
     assert "ddpg is not among the runs" in without
+
+
+def test_tasks_without_a_rival_are_not_ranked(tmp_path: Path) -> None:
+    runs(tmp_path / "one", {"td3": 1_000}, 3)
+    runs(tmp_path / "one", {"td3": 1_000}, 3, "Walker2d-v5")
+    assert headline(compare([tmp_path / "one"])) == (
+        "td3 was run on 2 tasks, beside no other algorithm."
+    )
+    runs(tmp_path / "apart", {"td3": 1_000}, 3)
+    runs(tmp_path / "apart", {"sac": 1_000}, 3, "Walker2d-v5")
+    line = headline(compare([tmp_path / "apart"]))
+    assert "td3 was run beside no other, so no difference is tested." in line
+
+
+def test_single_runs_are_not_told_apart_by_an_interval(tmp_path: Path) -> None:
+    for env in ("Ant-v5", "Walker2d-v5"):
+        runs(tmp_path, {"td3": 1_000, "sac": 2_000}, 1, env)
+    assert "sac is of too few runs to tell on 2 of 2 tasks" in headline(compare([tmp_path]))

@@ -209,3 +209,11 @@ def test_jackknife_error_is_the_deviation_over_repetitions() -> None:
     found = [stats.best_of_two(rng.normal(size=12)) for _ in range(500)]
     errors = [(one.high - one.low) / 2 / scipy.t.ppf(0.975, 11) for one in found]
     assert np.mean(errors) == pytest.approx(np.std([one.value for one in found]), rel=0.1)
+
+
+@pytest.mark.filterwarnings("error")
+def test_iqm_of_runs_that_are_equal_but_one() -> None:
+    """Of ten runs, nine at a task's largest return: BCa has no interval, the percentile has."""
+    found = stats.iqm([numbers(*[1000.0] * 9, 900.0)])
+    assert found.value == found.high == 1000
+    assert 900 < found.low <= 1000

@@ -124,7 +124,7 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     words += ["--warmup", "300"]  # these two do come to updates
     assert main([*words, "-q"]) == 0
     printed = capsys.readouterr()
-    assert re.match(r"2 trials, 0 pruned, 0 failed; best [\d.]+ in trial (\d)\n", printed.out)
+    assert re.match(r"2 complete, 0 pruned, 0 failed; best [\d.]+ in trial (\d)\n", printed.out)
     assert "settings: a.best.toml" in printed.out
     assert re.fullmatch(
         r"(trial \d of 2: return [\d.]+, best [\d.]+ in trial \d\n){2}", printed.err
@@ -235,7 +235,7 @@ def test_pruned_trial(capsys: pytest.CaptureFixture[str]) -> None:
     assert [state for state, *_ in made(tuning)] == ["PRUNED"] * 2
     assert all(list(reported) == [1] for *_, reported in made(tuning))
     assert not tuning.best_file.exists()
-    assert tuning.summary() == "0 trials, 2 pruned, 0 failed"
+    assert tuning.summary() == "0 complete, 2 pruned, 0 failed"
     for run in find_all(tuning.runs):
         assert run.rows()[-1]["step"] == 100
         assert not run.state_file.parent.exists()
@@ -266,7 +266,7 @@ def test_failed_trial_counts_and_the_study_goes_on(
     tuning.run(silent)
     assert [state for state, *_ in made(tuning)] == ["FAIL", "COMPLETE"]
     assert "trial 0 of 2: failed: member 0, step 3: a bolt fell out\n" in capsys.readouterr().err
-    assert tuning.summary().startswith("1 trials, 0 pruned, 1 failed; best")
+    assert tuning.summary().startswith("1 complete, 0 pruned, 1 failed; best")
 
 
 # Bad input.
@@ -353,7 +353,7 @@ def test_two_workers_one_of_which_is_killed(here: Path) -> None:
     victim.communicate()
     out, err = survivor.communicate(timeout=120)
     assert survivor.returncode == 0, err
-    counts = re.match(r"(\d) trials, (\d) pruned, 0 failed; best", out)
+    counts = re.match(r"(\d) complete, (\d) pruned, 0 failed; best", out)
     assert counts
     assert int(counts[1]) + int(counts[2]) == 4
     names = {run.settings()["name"] for run in find_all("s.log.runs")}
@@ -381,3 +381,15 @@ def test_interrupted_worker_saves(here: Path) -> None:
     (run,) = find_all("tune.log.runs")
     assert not run.in_use()
     assert RunDirectory(run.path).rows()[-1]["step"] > 0
+
+
+def test_a_study_whose_trials_all_failed_is_no_success(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(tuning: Tuning, trial: Any) -> Any:
+        raise TrainingError("member 0, step 3: a bolt fell out")
+
+    monkeypatch.setattr(Tuning, "_trainer_of", fail)
+    words = ["tune", "td3", PROBE, "--trials", "2", "--steps", "300", "-q"]
+    assert main(words) == 1
+    assert "0 complete, 0 pruned, 2 failed" in capsys.readouterr().out

@@ -21,7 +21,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
-from pacesetter.tracking.live import MOST_EPISODES, curve, curves, serving
+from pacesetter.tracking.live import MOST_EPISODES, PAGE, curve, curves, serving
 
 EVALUATIONS = 4
 
@@ -285,3 +285,17 @@ def wait_for(browser: Any, expression: str, value: Any) -> None:
     while browser.execute_script(f"return {expression}") != value:
         assert time.monotonic() < end, browser.execute_script(f"return {expression}")
         time.sleep(0.1)
+
+
+def test_only_evaluations_are_drawn(run: RunDirectory) -> None:
+    """A row of another kind may hold anything, words that a page would run included."""
+    words = "<img src=x onerror=alert(1)>"
+    run.log.append({"kind": "note", "step": 2_001, "mean": words, "returns": [1.0]} | LEDGER)
+    assert "onerror" not in json.dumps(curve(run))
+    assert "Number(value).toLocaleString" in PAGE.read_text()
+
+
+def test_a_run_that_met_its_goal_is_over(runs: Path) -> None:
+    met = make_run(runs, budget=2_000, planned=4_000, evaluations=4, name="met", stop_at=0.0)
+    for path, over in ((met, True), (make_run(runs, budget=2_000, planned=4_000), False)):
+        assert curve(evaluated(path, EVALUATIONS))["is_over"] is over

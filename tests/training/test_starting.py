@@ -186,3 +186,29 @@ def test_steps_are_sorted_as_numbers(runs: Path) -> None:
     assert {file.stem for file in (run.path / "policies").iterdir()} == {
         "step-90", "step-100", "step-110"
     }  # fmt: skip
+
+
+def test_the_scale_of_rewards_goes_with_the_critics(runs: Path) -> None:
+    old = trained(runs, normalize_reward=True)
+    source = str(old.directory.path)
+    new = Trainer(
+        "td3", ENV, runs=runs, name="new", start_from=source, **SHORT, normalize_reward=True
+    )
+    before, now = old.loop.experience.returns, new.loop.experience.returns
+    assert now.deviation == before.deviation != 1
+    assert not now.running.any()
+    new.close()
+    with pytest.raises(UsageError, match="has normalize_reward=True, this run False"):
+        Trainer("td3", ENV, runs=runs, name="other", start_from=source, **SHORT)
+
+
+@pytest.mark.parametrize("rule", ["best", "none"])
+def test_a_run_that_stops_at_a_return_has_logged_every_episode(runs: Path, rule: str) -> None:
+    short = trained(
+        runs, "multi-td3", steps=2000, eval_every=1000, stop_at=-1e9, rule=rule,
+        env_kwargs={"max_episode_steps": 50},
+    )  # fmt: skip
+    ended = [row["episodes_ended"] for row in log(short.directory) if row["kind"] == "train"]
+    assert sum(map(len, ended)) == short.progress.episodes > 0
+    assert not short.progress.ended
+    assert [row["step"] for row in log(short.directory) if row["kind"] == "eval"][-1] < 2000

@@ -61,6 +61,7 @@ def add_seed(command: Parser) -> None:
 
 def parse(command: Parser, words: list[str]) -> tuple[Namespace, Found]:
     """The flags, and the policy that RUN means."""
+    from pacesetter.envs.ids import full_id
     from pacesetter.policy import load
 
     words, env_kwargs = split_env_kwargs(words)
@@ -70,7 +71,8 @@ def parse(command: Parser, words: list[str]) -> tuple[Namespace, Found]:
     file = policy_file(given.run, given.runs)
     policy = load(file)
     own = policy.about.get("env")
-    env = given.env or (own if own in given.allow else None)
+    named = full_id(given.env) if given.env else None
+    env = named or (own if own in given.allow else None)
     if (env or own) == own:
         env_kwargs = policy.about.get("env_kwargs", {}) | env_kwargs
     return given, Found(policy, file, env, env_kwargs, _wrap(policy.about, env, given))

@@ -24,7 +24,7 @@ def tune(words: list[str]) -> int:
     if received and not tuning.over:
         print(f"saved; go on with `pacesetter tune {shlex.join(words)}`")
         return exit_code(received)
-    return 0
+    return 1 if tuning.over and not tuning.any_complete else 0
 
 
 def _parse(words: list[str]) -> tuple[str, str, Settings, dict[str, Any]]:

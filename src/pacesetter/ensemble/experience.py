@@ -40,6 +40,8 @@ class Experience:
         for transition in self.queues[i].flush():
             replay.add(transition, i)
         replay.sampler.end(i, None)
+        if self.returns:
+            self.returns.running[i] = 0.0
 
     def add(self, i: int, transition: Transition) -> None:
         """Env i made a step."""

@@ -122,6 +122,6 @@ class Explorer:
         if not self._running:
             self.env.episode = snapshot.episode
         elif not (self.env.restore(snapshot) and self.env.earned == table["earned"]):
-            self.starting = True
+            self.starting, self.pending = True, None
             return f"{self.env.name} does not repeat an episode exactly; a new one starts"
         return None

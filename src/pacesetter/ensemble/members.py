@@ -115,6 +115,8 @@ class Members:
             self._begin_collecting()
         while progress.acting:
             i = progress.acting[0]
+            if self.explorers[i].starting:  # a resumed run could not restore its episode
+                self._start_episode(i)
             with blame(i % members, progress.step):
                 self._step(i)
             del progress.acting[0]
@@ -125,6 +127,8 @@ class Members:
             if explorer.starting:
                 self._start_episode(i)
         due = [self._updates_due(k) for k in range(members)]
+        for member, has_due in zip(progress.members, due, strict=True):
+            member.ended = member.ended and has_due
         acting = [i for i, e in enumerate(self.explorers) if e.active and not due[i % members]]
         progress.acting = acting[: self.budget - progress.step]
 
@@ -158,10 +162,12 @@ class Members:
     def _end_episode(self, i: int, k: int) -> None:
         progress, explorer = self.progress, self.explorers[i]
         member, total = progress.members[k], explorer.env.earned
+        member.ended = True
         progress.end_episode(k, total, len(explorer.env.actions))
         self.experience.end_episode(i, total)
         self.selector.end_episode(k, total, explorer.started, member.copied)
-        if self.config.hyper.assess and explorer.started >= self.config.hyper.warmup:
+        whole = explorer.started >= max(self.config.hyper.warmup, member.copied)
+        if self.config.hyper.assess and whole:
             updates = member.update_calls * self.updates.per_call
             policy = self.current_policy(k)
             self.policy_checkpoints.end_episode(k, total, updates, policy, progress.step)
@@ -183,12 +189,10 @@ class Members:
 
     def _updates_due(self, k: int) -> bool:
         hyper, member = self.config.hyper, self.progress.members[k]
-        if member.updates_due < self.updates.per_call or not len(self.experience.replay(k)):
+        later = member.steps % hyper.block * hyper.updates_per_step  # of a block that is not full
+        if member.updates_due - later < self.updates.per_call or not len(self.experience.replay(k)):
             return False
-        if member.steps % hyper.block >= hyper.num_envs:  # no block was filled by the last tick
-            return False
-        own = self.explorers[k :: self.config.run.members]
-        if hyper.update_at == "episode" and all(explorer.active for explorer in own):
+        if hyper.update_at == "episode" and not member.ended:
             return False
         return self.policy_checkpoints.may_update(k)
 
@@ -221,7 +225,7 @@ class Members:
         learner, copy = self.learners.compiled.learner, self.config.run.copy
         states = copy_from_parents(learner, self.learners.states, parents, copy, weights)
         self.learners.replace(states)
-        self.policy_checkpoints.copy(parents)
+        self.policy_checkpoints.copy(parents, averaged=weights is not None)
         self.averages.copy(selection.choice)
         self.progress.copy(selection.choice)
         self.progress.champion = selection.champion

@@ -93,13 +93,16 @@ class PolicyCheckpoints:
         kept = self.kept[k]
         return kept and replace(kept, about=dict(kept.about))
 
-    def copy(self, parents: Parents) -> None:
-        """Every member takes over what was found of its parent's policy."""
+    def copy(self, parents: Parents, averaged: bool) -> None:
+        """Every member takes over what was found of its parent's policy; no episode was played by
+        a policy that is averaged.
+        """
         before = self.assessments
         self.kept = [self.kept[parent] for parent in parents]
+        returns = [[] if averaged else list(before[parent].returns) for parent in parents]
         self.assessments = [
-            replace(before[parent], returns=list(before[parent].returns), over=own.over)
-            for parent, own in zip(parents, before, strict=True)
+            replace(before[parent], returns=returns[k], over=before[k].over)
+            for k, parent in enumerate(parents)
         ]
 
     def training_values(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ class Member:
     update_calls: Natural = 0
     updates_due: Finite = 0.0  # critic updates
     copied: Natural = 0  # step of the run at which it last became another's copy
+    ended: bool = False  # whether an episode has ended whose updates are not all made
     scales: dict[str, Finite] = field(default_factory=dict[str, float])  # factors of settings
 
 

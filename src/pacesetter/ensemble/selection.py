@@ -80,11 +80,15 @@ class Selector:
             self.returns[k].append(total)
 
     def on_training(self, progress: Progress) -> Selection | None:
-        """Select on the training episodes since the last selection, once each member has enough."""
-        window = self.config.run.window
-        if min(len(returns) for returns in self.returns) < window:
+        """Select on the training episodes since the last selection, once each member has enough.
+
+        A round with several envs per member counts whole: its last episodes are its longest.
+        """
+        run, fewest = self.config.run, min(len(returns) for returns in self.returns)
+        if fewest < run.window:
             return None
-        returns = np.array([each[-window:] for each in self.returns])
+        counted = fewest if run.wait else run.window
+        returns = np.array([each[-counted:] for each in self.returns])
         self.returns = [[] for _ in self.returns]
         return self._select(returns, progress, paired=False)
 

@@ -55,6 +55,10 @@ def _check_bases(run: Ensemble, hyper: Any) -> None:
         raise UsageError("vary: exploration_noise itself is 0; must be above 0 to vary")
     if "gamma" in run.vary and not 0 < hyper.gamma < 1:
         raise UsageError(f"vary: gamma itself is {hyper.gamma}; must lie between 0 and 1 to vary")
+    if "gamma" in run.vary and getattr(hyper, "bins", 0):
+        raise UsageError(
+            "vary: gamma cannot differ with --bins, whose range fits the returns of one gamma"
+        )
     if "gamma" in run.vary and hyper.n_step > 1:
         raise UsageError(
             f"vary: gamma cannot differ with n_step={hyper.n_step}, as members share discounted "

@@ -4,6 +4,7 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import Evaluation, evaluate
 from pacesetter.files import present
@@ -30,7 +31,7 @@ def push(
     private: bool = False,
     episodes: int = 10,
     seed: int = 0,
-    env: str | None = None,
+    env: str | Recipe | None = None,
 ) -> str:
     """Send a policy file and a model card, in one commit, to `repo_id` (USER/NAME); its address.
 
@@ -96,14 +97,16 @@ def card(
         ("training", f"{about.get('step', 0):,} env steps, seed {about.get('seed')}"),
         ("return", f"{_score(fresh)} over {len(fresh.returns)} fresh episodes, seed {seed}"),
     ]
-    if "score" in about:
+    if isinstance(about.get("score"), (int, float)):
         rows.append(
             (
                 "return in training",
                 f"{about['score']:,.1f} over {about.get('score_episodes')} episodes",
             )
         )
-    versions = (f"{name} {number}" for name, number in about.get("versions", {}).items())
+    made_with = about.get("versions")
+    found = made_with.items() if isinstance(made_with, dict) else ()
+    versions = (f"{name} {number}" for name, number in found)
     rows.append(("versions", ", ".join(versions)))
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)
     trained = f"\n## Training\n\n```\n{command}\n```\n" if command else ""

@@ -51,7 +51,13 @@ class SB3Policy:
         return self.policy(observation), state
 
 
-def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
+def to_sb3(
+    policy: Policy,
+    path: Path,
+    *,
+    env: str | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+) -> Path:
     """Write a short script that makes the `model`, and beside it the policy file, which it names.
 
     No SB3 .zip is written: it would have to claim critics and an optimiser that are not there.
@@ -65,7 +71,8 @@ def to_sb3(policy: Policy, path: Path, *, env: str | None = None) -> Path:
     file = path.with_suffix(".safetensors")
     if file.exists():
         raise UsageError(f"sb3: {file} exists; give {path.name} another name")
-    kwargs = policy.about.get("env_kwargs", {}) if name == policy.about.get("env") else {}
+    own = policy.about.get("env_kwargs", {}) if name == policy.about.get("env") else {}
+    kwargs = own if env_kwargs is None else env_kwargs
     text = SCRIPT.format(task=f"{name!r}, **{kwargs!r}" if kwargs else repr(name))
     try:
         policy.save(file)

@@ -48,8 +48,9 @@ class ByReturn(Sampler):
         if self.to_go:
             self.ranking = np.sort(self._sampled())
         else:  # kept sorted: a full sort would cost more with every short episode
-            left = np.delete(self.ranking, [self.ranking.searchsorted(score) for score in gone])
-            self.ranking = np.insert(left, left.searchsorted(total), total)
+            for score in gone:  # one by one, since several may be equal
+                self.ranking = np.delete(self.ranking, self.ranking.searchsorted(score))
+            self.ranking = np.insert(self.ranking, self.ranking.searchsorted(total), total)
 
     def sample(
         self, rng: np.random.Generator, shape: Shape, window: range, done: float
@@ -87,8 +88,9 @@ class ByReturn(Sampler):
         self.size = max(self.size, len(window))
         self.scores = np.full(self.size, np.nan)
         self.scores[: len(window)] = arrays["scores"]
-        self.ranking = arrays["ranking"]
         self.ended = deque((float(total), int(last)) for total, last in arrays["ended"])
+        totals = np.sort(np.array([total for total, _ in self.ended]))
+        self.ranking = arrays["ranking"] if self.to_go else totals
         self.running = {}
         for env, number, earned in arrays["running"]:
             self.running.setdefault(int(env), []).append((int(number), float(earned)))

@@ -18,7 +18,7 @@ PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoc
 def provenance(**found: Any) -> dict[str, Any]:
     """Where this process runs and with what; `found` is what the learner's side knows of that."""
     return {
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([_program(), *sys.argv[1:]]),
         "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
@@ -31,6 +31,12 @@ def provenance(**found: Any) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide results."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def _program() -> str:
+    """How to call what runs: `python -m pacesetter` is the same as `pacesetter`."""
+    name = Path(sys.argv[0]).name
+    return "pacesetter" if name == "__main__.py" else name
 
 
 def _commit() -> str | None:

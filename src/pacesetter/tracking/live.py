@@ -11,7 +11,7 @@ from typing import Any
 
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory
-from pacesetter.settings.budget import budget
+from pacesetter.settings.budget import Standing, budget, is_spent, standing
 from pacesetter.storage import FAULTS
 
 Runs = Callable[[], Iterable[RunDirectory]]  # asked at each look, so that new runs join
@@ -53,12 +53,15 @@ def _curve_or_fault(run: RunDirectory, most: int) -> Row:
 def curve(run: RunDirectory, most: int = MOST_EPISODES) -> Row:
     """Steps and returns of a run's evaluations, and of at most so many training episodes."""
     settings = run.settings()
+    logged, now = _logged(run.path, _size(run.metrics_file), most)
+    step, seconds = logged["spent"][-1] if logged["spent"] else (0, 0.0)
     return {
         "name": str(run.path),
         "title": f"{settings['env']}, {settings['name']}, seed {settings['seed']}",
         "budget": budget(settings),
         "is_running": run.in_use(),
-        **_logged(run.path, _size(run.metrics_file), most),
+        "is_over": is_spent(settings, step, seconds, now),
+        **logged,
     }
 
 
@@ -72,15 +75,19 @@ def _size(file: Path) -> tuple[int, int] | None:
 
 
 @lru_cache(KEPT)
-def _logged(run: Path, size: tuple[int, int] | None, most: int) -> Row:
-    """The part of a curve that comes from the log, whose size says whether it has grown."""
+def _logged(run: Path, size: tuple[int, int] | None, most: int) -> tuple[Row, Standing]:
+    """The part of a curve that comes from the log, whose size says whether it has grown, and how
+    its evaluations stand.
+    """
     rows = RunDirectory(run).rows()
-    return {
-        "evaluations": [_evaluation(row) for row in rows if row.get("mean") is not None],
+    evaluated = [row for row in rows if row["kind"] == "eval" and row["mean"] is not None]
+    curve = {
+        "evaluations": [_evaluation(row) for row in evaluated],
         "episodes": _episodes(rows, most),
         "spent": [[row["step"], row["wall_seconds"]] for row in rows[-20:]],
         "updates": rows[-1]["updates"] if rows else 0,
     }
+    return curve, standing((row["step"], row["mean"], row["updates"]) for row in evaluated)
 
 
 def _evaluation(row: Row) -> list[float]:

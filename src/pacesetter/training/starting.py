@@ -18,8 +18,8 @@ def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
     """Give every member what `--start-from` names; the replay, the counters and noise start anew.
 
     A run gives the whole state of its champion, optimiser state included, and the statistics that
-    normalize observations. A policy file gives the actor alone. Raises UsageError if it does not
-    fit this run.
+    normalize observations and rewards. A policy file gives the actor alone. Raises UsageError if it
+    does not fit this run.
     """
     source = str(config.run.start_from)
     try:
@@ -36,15 +36,19 @@ def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None
     arrays, table = storage.read(directory.state_file, "checkpoint")
     old = {**directory.settings(), **table["run"]}
     new = config.settings()
-    for name in ("algorithm", "normalize_observation"):
-        if old[name] != new[name]:
+    for name in ("algorithm", "normalize_observation", "normalize_reward"):
+        if old.get(name, False) != new.get(name, False):
             raise UsageError(
-                f"start_from: {directory.path} has {name}={old[name]}, this run {new[name]}"
+                f"start_from: {directory.path} has {name}={old.get(name)}, this run {new.get(name)}"
             )
     champion = int(table["progress"]["champion"])
     found = below(f"states.{champion}", arrays)
     loop.learners.replace([_copied(state, found) for state in loop.learners.states])
-    loop.parts()["normalizer"].restore({}, below("normalizer", arrays))
+    parts = loop.parts()
+    parts["normalizer"].restore({}, below("normalizer", arrays))
+    if "returns" in parts:  # the critics' values are in units of its deviation
+        fresh = parts["returns"].arrays()
+        parts["returns"].restore({}, fresh | {"sums": below("returns", arrays)["sums"]})
 
 
 def _from_policy(loop: Loop, file: Path) -> None:

@@ -156,6 +156,8 @@ class Trainer:
                 self._reporter.tell_time()
                 ending = self._spent
                 yield from self._reporter.due(ending)
+                if self._settled and not ending:
+                    yield from self._reporter.due(ending=True)
                 if ending or self._stopping or self._settled:
                     break
                 if self._save_is_due():

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, resolve
+from pacesetter.config import Config, full_id, resolve
 from pacesetter.consent import require, require_all
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import RunDirectory
@@ -175,7 +175,7 @@ def _flags(settings: Settings) -> Iterable[str]:
 def _envs(value: Any) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value) or not value:
         raise UsageError("envs: must be a list of env ids, such as --envs Ant-v5 Walker2d-v5")
-    return list(dict.fromkeys(value))
+    return list(dict.fromkeys(map(full_id, value)))
 
 
 def _seeds(value: Any) -> list[int]:

@@ -105,7 +105,7 @@ def _short_of(run: Run, limit: Limit) -> str | None:
 def _refuse_twins(runs: list[Run]) -> None:
     seen: dict[tuple[Any, ...], Run] = {}
     for run in runs:
-        key = (run.env, run.name, run.seed, run.budget)
+        key = (run.env, run.name, run.seed)
         if key in seen:
             raise UsageError(
                 f"run: {seen[key].source} and {run.source} are both {run.env} {run.name} "

@@ -69,9 +69,10 @@ class Run:
 
     @property
     def env(self) -> str:
-        """The task: env id with version, and keywords if there are any."""
-        kwargs = self.settings.get("env_kwargs") or {}
-        return printable(" ".join([self.settings["env"], *(f"{k}={v}" for k, v in kwargs.items())]))
+        """The task: env id with version, and keywords and wrappers if there are any."""
+        kwargs, wrap = self.settings.get("env_kwargs") or {}, self.settings.get("wrap") or ()
+        words = [f"{k}={v}" for k, v in kwargs.items()] + [f"wrap={name}" for name in wrap]
+        return printable(" ".join([self.settings["env"], *words]))
 
     @property
     def name(self) -> str:
@@ -117,7 +118,7 @@ class Run:
 
     def within(self, cpu: float) -> "Run":
         """The run as it was when it had spent so many CPU seconds."""
-        return self.cut(int(self.clock[self.cpu <= cpu].max(initial=0)))
+        return self.cut(int(self.clock[self.cpu <= cpu].max(initial=-1)))
 
     def metric(self, name: str) -> float:
         """`final`, `auc` or `max`; the last is over evaluations after the first update."""

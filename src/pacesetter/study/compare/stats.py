@@ -140,11 +140,19 @@ def iqm(tasks: Sequence[Array]) -> Interval:
         return Interval(value)
     if all(np.ptp(task) == 0 for task in tasks):
         return Interval(value, value, value)
-    method = "BCa" if len(tasks) == 1 else "percentile"
-    found = scipy.bootstrap(
-        tuple(tasks), _iqm, n_resamples=RESAMPLES, vectorized=True, method=method, rng=0
-    )
-    return Interval(value, *map(float, found.confidence_interval))
+    low, high = _bootstrapped(tasks, "BCa" if len(tasks) == 1 else "percentile")
+    if np.isnan(low):  # all runs but one are equal, and BCa divides 0 by 0
+        low, high = _bootstrapped(tasks, "percentile")
+    return Interval(value, low, high)
+
+
+def _bootstrapped(tasks: Sequence[Array], method: str) -> list[float]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = scipy.bootstrap(
+            tuple(tasks), _iqm, n_resamples=RESAMPLES, vectorized=True, method=method, rng=0
+        )
+    return [*map(float, found.confidence_interval)]
 
 
 def _iqm(*tasks: Array, axis: int = -1) -> Any:

@@ -96,8 +96,9 @@ def speed(comparison: Comparison) -> Table:
     for group in comparison.groups:
         row = [word(group.env), word(group.name), number(len(group.runs))]
         row += [soon(group.reached(level)) for level in LEVELS]
-        cost = np.array([1_000 * run.cpu[-1] / run.steps[-1] for run in group.runs])
-        rate = np.array([run.steps[-1] / run.wall[-1] for run in group.runs])
+        made = np.array([run.steps[-1] or np.nan for run in group.runs])
+        cost = 1_000 * np.array([run.cpu[-1] for run in group.runs]) / made
+        rate = made / np.array([run.wall[-1] for run in group.runs])
         rows.append([*row, interval(stats.mean(cost), 2), interval(stats.mean(rate))])
     levels = [f"env steps to {level:,}" for level in LEVELS]
     notes = [

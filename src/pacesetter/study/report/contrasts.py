@@ -101,6 +101,7 @@ def best_of_two(comparison: Comparison) -> list[Table]:
         budget = control.budgets[0]
         half = control.cut(budget // 2)
         enough = min(len(run.steps) for run in half.runs) >= stats.FEWEST_EVALUATIONS
+        enough = enough and half.budgets == [budget // 2]  # else no evaluation was there
         one = stats.mean(control.values(comparison.metric))
         halves = stats.best_of_two(half.values(comparison.metric)) if enough else Interval(np.nan)
         both = stats.best_of_two(control.values(comparison.metric))

@@ -61,8 +61,8 @@ def _tally(comparison: Comparison) -> str:
         if control is not None and control is not group:
             x, y = group.values(comparison.metric), control.values(comparison.metric)
             low, high = stats.difference(x, y)[1:]
-            place = 0 if low > 0 else 1 if high < 0 else 2
-            counts.setdefault(group.name, [0, 0, 0])[place] += 1
+            place = 3 if np.isnan(low) else 0 if low > 0 else 1 if high < 0 else 2
+            counts.setdefault(group.name, [0, 0, 0, 0])[place] += 1
     if not counts:
         return ""
     words = [f"{name} is {_places(places)}" for name, places in [*counts.items()][:MOST]]
@@ -77,7 +77,7 @@ def _tally(comparison: Comparison) -> str:
 
 def _places(counts: list[int]) -> str:
     total = sum(counts)
-    words = ("ahead", "behind", "not told apart")
+    words = ("ahead", "behind", "not told apart", "of too few runs to tell")
     found = [
         f"{word} on {count} of {total} task{'s' if total > 1 else ''}"
         for word, count in zip(words, counts, strict=True)
@@ -87,17 +87,21 @@ def _places(counts: list[int]) -> str:
 
 
 def _leaders(comparison: Comparison) -> str:
-    """How many tasks each algorithm leads, where there is no control."""
+    """How many tasks each algorithm leads, where no task has the control beside another."""
     metric, led = comparison.metric, dict[str, int]()
+    names = {group.name for group in comparison.groups}
+    if len(names) == 1:
+        return f"{names.pop()} was run on {len(comparison.envs)} tasks, beside no other algorithm."
     for env in comparison.envs:
         groups = [group for group in comparison.groups if group.env == env]
         name = max(groups, key=lambda group: _mean(group, metric)).name
         led[name] = led.get(name, 0) + 1
     ranked = sorted(led.items(), key=lambda item: -item[1])[:MOST]
     words = ", ".join(f"{name} on {count}" for name, count in ranked)
+    beside = "was run beside no other" if comparison.reference in names else "is not among the runs"
     return (
         f"The highest {NAMES[metric].lower()} of {len(comparison.envs)} tasks: {words}; "
-        f"{comparison.reference} is not among the runs, so no difference is tested."
+        f"{comparison.reference} {beside}, so no difference is tested."
     )
 
 

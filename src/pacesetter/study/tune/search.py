@@ -99,6 +99,11 @@ class Tuning:
         trials = self.study.get_trials(deepcopy=False)
         return sum(trial.state.is_finished() for trial in trials) >= self.trials
 
+    @property
+    def any_complete(self) -> bool:
+        """Whether a trial has a score."""
+        return any(t.state == COMPLETE for t in self.study.get_trials(deepcopy=False))
+
     def run(self, show: Show) -> None:
         """Make trials until all have ended or other workers have them; `show` shows each one."""
         while not self._stopping and (claim := self._claim()):
@@ -113,7 +118,7 @@ class Tuning:
         """How many trials there were and where the best settings are."""
         states = [trial.state for trial in self.study.get_trials(deepcopy=False)]
         complete, pruned, failed = (states.count(s) for s in (COMPLETE, PRUNED, FAILED))
-        text = f"{complete} trials, {pruned} pruned, {failed} failed"
+        text = f"{complete} complete, {pruned} pruned, {failed} failed"
         if not complete:
             return text
         best = self.study.best_trial
@@ -188,7 +193,7 @@ class Tuning:
     def _tell(self, trial: optuna.Trial, state: Any, value: float | None, text: str) -> None:
         with alone(self._lock):
             self.study.tell(trial, value, state)
-            if any(t.state == COMPLETE for t in self.study.get_trials(deepcopy=False)):
+            if self.any_complete:
                 best = self.study.best_trial
                 text = f"{text}, best {best.value:.1f} in trial {best.number}"
                 write_atomically(self.best_file, self._best_toml(best).encode())
