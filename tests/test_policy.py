@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from policies import untrained
 from short_runs import TINY, run_to_end
 
 from pacesetter.cli.main import main
@@ -236,6 +237,20 @@ def test_eval_on_another_version_of_the_task(
     make_policy("Walker2d-v5", rng).save(file)
     assert main(["eval", str(file), "--episodes", "1", "--env", "Walker2d-v4"]) == 0
     assert capsys.readouterr().out.startswith("Walker2d-v4: return")
+
+
+def test_an_id_without_a_version_is_the_policys_own_task(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the keywords that it was trained with, in Python and on the command line."""
+    own, file = untrained("Pendulum-v1", env_kwargs={"g": 2.0}), tmp_path / "policy.safetensors"
+    assert evaluate(own, "Pendulum", 1, seed=1) == evaluate(own, None, 1, seed=1)
+    own.save(file)
+    said: list[str] = []
+    for words in ([], ["--env", "Pendulum"]):
+        assert main(["eval", str(file), "--episodes", "1", *words]) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1]
 
 
 def test_random_actions_are_a_baseline() -> None:

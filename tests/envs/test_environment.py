@@ -222,6 +222,25 @@ def test_env_that_does_not_repeat_is_reported(runs: Any) -> None:
     assert (last.step, resumed.finished) == (260, True)
 
 
+def test_a_new_episode_has_nothing_of_the_one_that_does_not_repeat(runs: Any) -> None:
+    """Not its return so far, nor the action that was chosen when the task's fault broke it off."""
+    settings = {**TINY, "steps": 260, "warmup": 250, "normalize_reward": True}
+    trainer = Trainer("td3", f"broken_envs:{Restless.__name__}-v0", runs=runs, **settings)
+    for _ in range(5):
+        trainer.loop.tick()
+    trainer.loop.explorers[0].pending = np.zeros(1, np.float32)
+    trainer.progress.acting = [0]
+    trainer.save()
+    trainer.close()
+    resumed = Trainer.resume(trainer.directory.path)
+    assert resumed.loop.explorers[0].pending is None
+    resumed.loop.tick()
+    explorer, returns = resumed.loop.explorers[0], resumed.loop.experience.returns
+    resumed.close()
+    assert len(explorer.env.actions) == 1
+    assert returns.running[0] == explorer.env.earned
+
+
 def test_env_that_remembers_earlier_episodes_is_reported(runs: Any) -> None:
     """The observations repeat, but what the episode earned does not."""
     settings = {**TINY, "steps": 260, "warmup": 260, "eval_every": 260, "renew_env": False}
