@@ -147,6 +147,11 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             raise UsageError(
                 "randomize: --known takes the reward of one task, not of many; give --no-known"
             )
+        if run.wrap and getattr(hyper, "known", False):
+            raise UsageError(
+                "wrap: --known takes the reward of the plain task, not of a wrapped one; "
+                "give --no-known"
+            )
         rollout = hyper.parallel_envs * hyper.rollout_length
         if run.steps < rollout:
             raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")

@@ -12,6 +12,7 @@ from stopping import stop_at
 
 from pacesetter import policy
 from pacesetter.cli.show import state
+from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory
 from pacesetter.settings.budget import Standing, standing
@@ -212,3 +213,20 @@ def test_a_run_that_stops_at_a_return_has_logged_every_episode(runs: Path, rule:
     assert sum(map(len, ended)) == short.progress.episodes > 0
     assert not short.progress.ended
     assert [row["step"] for row in log(short.directory) if row["kind"] == "eval"][-1] < 2000
+
+
+def test_refuses_an_actor_of_other_functions(runs: Path) -> None:
+    """The shapes fit, but a tanh network's weights mean something else with ReLUs."""
+    found = policy.Policy(
+        [[{"kernel": np.ones((3, 1), np.float32), "bias": np.zeros(1, np.float32)}]],
+        "tanh", "clip", -2 * np.ones(1, np.float32), 2 * np.ones(1, np.float32), about={"env": ENV},
+    )  # fmt: skip
+    found.save(runs.parent / "other.safetensors")
+    with pytest.raises(UsageError, match="has an actor of tanh and clip, this run's has relu and"):
+        Trainer("td3", ENV, runs=runs, start_from=str(runs.parent / "other.safetensors"), **SHORT)
+
+
+def test_refuses_a_wrapped_task_whose_reward_is_known() -> None:
+    with pytest.raises(UsageError, match="wrap: --known takes the reward of the plain task"):
+        resolve("me-trpo", "Swimmer-v5", {"wrap": ("odd_envs:Doubled",)})
+    resolve("me-trpo", "Swimmer-v5", {"wrap": ("odd_envs:Doubled",), "known": False})

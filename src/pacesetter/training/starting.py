@@ -61,6 +61,12 @@ def _from_policy(loop: Loop, file: Path) -> None:
             "name its run"
         )
     learner, states = loop.learners.compiled.learner, loop.learners.states
+    own = learner.policy(states[0])
+    if (found.activation, found.output) != (own.activation, own.output):
+        raise UsageError(
+            f"start_from: {file} has an actor of {found.activation} and {found.output}, this run's "
+            f"has {own.activation} and {own.output}"
+        )
     loop.learners.replace([learner.with_actor(state, found.actors[0]) for state in states])
 
 
