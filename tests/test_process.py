@@ -205,3 +205,10 @@ def test_a_bad_environment_is_a_line_each(tmp_path: Path) -> None:
         "pacesetter: JAX_PLATFORMS: this machine has no 'abacus'; unset it, or set it to cpu"
     )
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_records_a_command_that_can_be_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one that `bench` makes by `python -m pacesetter`."""
+    for program in ("/venv/bin/pacesetter", "/src/pacesetter/__main__.py"):
+        monkeypatch.setattr(sys, "argv", [program, "train", "td3", "Ant-v5"])
+        assert provenance()["command"] == "pacesetter train td3 Ant-v5"

@@ -701,3 +701,10 @@ def test_best_of_two_halves_needs_an_evaluation_at_half(tmp_path: Path) -> None:
         make_run(tmp_path, "Ant-v5", "td3", seed, budget=100_000, evaluations=5)
     row = contrasts.best_of_two(compare([tmp_path]))[0].rows[0]
     assert row[4].text == "-"
+
+
+def test_speed_of_a_run_that_made_no_step_is_not_known(tmp_path: Path) -> None:
+    for seed in range(3):
+        small(tmp_path, seed=seed)
+    (row,) = contents.speed(compare([tmp_path], budget="100")).rows
+    assert [cell.text for cell in row[-2:]] == ["-", "-"]
