@@ -3,13 +3,16 @@
 python results/summary.py                           prints the tables of all studies
 python results/summary.py --study pilot             of one
 python results/summary.py --figures DIR             also draws the curves into DIR/STUDY.pdf
-python results/summary.py --collect pilot RUNS...   first takes finished runs into pilot.jsonl
+python results/summary.py --collect pilot RUNS...   first takes finished runs into pilot.jsonl;
+                                                    with --unfinished others too
 
 `pacesetter compare results/pilot.jsonl --mixed` makes other tables of the same runs.
 """
 
 import argparse
 import json
+import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +20,21 @@ from pacesetter.runs import find_all
 from pacesetter.storage import as_json
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.groups import Comparison
-from pacesetter.study.compare.results import compact
+from pacesetter.study.compare.results import Run, compact, read
 from pacesetter.study.report import contents, contrasts, paper, tables
 from pacesetter.study.report.figures import pdf
 from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
+LEVELS = (2_000, 5_000, 8_000)  # returns of the frontier
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
-    "paper": [{"budget": "1M"}],
+    "paper": [{"budget": "1M"}, {"budget": "2M", "reference": "multi-td3"}],
     "paper-table-1": [{"budget": "50k", "reference": "sac"}],
-    "frontier": [{"budget": "100k", "reference": "td3-norm-128x2"}],
+    "frontier": [
+        {"budget": "100k", "reference": "td3-norm-128x2"},
+        {"budget": "100k", "reference": "crossq-small"},
+    ],
     "pilot": [
         {"budget": "100k"},
         {"budget": "100k", "reference": "multi-td3"},
@@ -47,18 +54,27 @@ STUDIES: dict[str, list[dict[str, str]]] = {
 }
 
 
-def collect(study: str, folders: list[str]) -> None:
-    """Take runs in, one line each; a line of the same task, name and seed gives way."""
+def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
+    """Take finished runs in, one line each; a line of the same task, name and seed gives way."""
     file = HERE / f"{study}.jsonl"
     old = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    new = [compact(run) for folder in folders for run in find_all(folder)]
-    table = {_key(line): line for line in (*old, *new)}
+    new: dict[tuple[str, ...], dict[str, Any]] = {}
+    for each in (run for folder in folders for run in find_all(folder)):
+        line = compact(each)
+        run = read(str(each.path), line)
+        if run is None or not (run.finished or unfinished):
+            print(f"left out as unfinished: {each.path}", file=sys.stderr)
+        elif new.setdefault(_key(line), line) is not line:
+            sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
+    table = {_key(line): line for line in old} | new
     lines = [as_json(table[key], separators=(",", ":")) for key in sorted(table)]
     file.write_text("".join(line + "\n" for line in lines))
 
 
 def _key(line: dict[str, Any]) -> tuple[str, ...]:
-    return tuple(json.dumps(line["settings"][key]) for key in ("env", "env_kwargs", "name", "seed"))
+    keys = ("env", "env_kwargs", "wrap", "name", "seed")
+    found = [line["settings"].get(key) for key in keys]  # an older line has no wrappers
+    return tuple(json.dumps([] if each is None else each, sort_keys=True) for each in found)
 
 
 def shown(study: str, limit: dict[str, str]) -> str:
@@ -66,10 +82,30 @@ def shown(study: str, limit: dict[str, str]) -> str:
     there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
     found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
     found += [*contrasts.best_of_two(there), contents.ledger(there.groups)]
+    if study == "frontier":
+        found.append(levels(there))
     if study == "trust-region" and (beside := paper.published(there)) is not None:
         found.append(beside)
     name, value = next(iter(limit.items()))
     return tables.markdown(f"{study}: {name} {value}", headline(there), there.notes, found)
+
+
+def levels(there: Comparison) -> tables.Table:
+    """Env steps and CPU seconds at which each seed first reached a return."""
+    rows: list[list[tables.Cell]] = []
+    for group in there.groups:
+        row = [tables.word(group.env), tables.word(group.name)]
+        for level in LEVELS:
+            row.append(tables.word(", ".join(_first(run, level) for run in group.runs)))
+        rows.append(row)
+    return tables.Table("Return reached", ["env", "algorithm", *map(str, LEVELS)], rows)
+
+
+def _first(run: Run, level: float) -> str:
+    steps = run.reached(level)
+    if not math.isfinite(steps):
+        return "never"
+    return f"{steps:,.0f} {run.cpu[run.clock == steps][0]:.0f}"
 
 
 def selections(there: Comparison) -> str:
@@ -84,12 +120,13 @@ def main() -> None:
     parser.add_argument("--study", choices=STUDIES, help="this one only")
     parser.add_argument("--collect", metavar=("STUDY", "RUNS"), nargs="+", help="take runs in")
     parser.add_argument("--figures", metavar="DIR", type=Path, help="where to draw curves")
+    parser.add_argument("--unfinished", action="store_true", help="collect these runs too")
     found = parser.parse_args()
     if found.collect:
         study, *folders = found.collect
         if study not in STUDIES or not folders:
             parser.error(f"--collect: a study ({', '.join(STUDIES)}), then folders of runs")
-        collect(study, folders)
+        collect(study, folders, found.unfinished)
     for study in [found.study] if found.study else STUDIES:
         if not (HERE / f"{study}.jsonl").exists():
             continue

@@ -1,9 +1,9 @@
 """Seeded rollouts of any policy, on envs and start states that training never sees."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, replace
 from math import inf
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from pacesetter.seeding import Stream, generator
 from pacesetter.types import Floats
 
 Act = Callable[[Floats], Floats]
+World = TypeVar("World", bound=Environment)
 
 
 @dataclass(frozen=True)
@@ -96,30 +97,39 @@ def enter(
     env: str | Recipe | None,
     seed: int,
     env_kwargs: dict[str, Any] | None = None,
+    kind: Callable[[Recipe, int, Stream], World] = Environment,
     **extra: Any,
-) -> Environment:
+) -> World:
     """Make the given task or the policy's own and check that they fit; `extra` are its keywords."""
-    about = policy.about if policy else {}
-    recipe = env if isinstance(env, Recipe) else _recipe(about, env, env_kwargs)
-    recipe = replace(recipe, kwargs=recipe.kwargs | extra)
-    world = Environment(recipe, seed, Stream.REPORT)
+    recipe = recipe_of(policy.about if policy else {}, env, env_kwargs)
+    world = kind(replace(recipe, kwargs=recipe.kwargs | extra), seed, Stream.REPORT)
     world.check()
     if policy is not None:
         _refuse_unfit(policy, world)
     return world
 
 
-def _recipe(about: dict[str, Any], env: str | None, env_kwargs: dict[str, Any] | None) -> Recipe:
-    """The task by its id, with what the policy's file says of it if it is the policy's own."""
+def recipe_of(
+    about: dict[str, Any],
+    env: str | Recipe | None,
+    env_kwargs: dict[str, Any] | None = None,
+    allow: Collection[str] = (),
+) -> Recipe:
+    """The task by its id, with what the policy's file says of it if it is the policy's own.
+
+    Names of modules that the file gives must be among `allow`, or loaded. Raises UsageError.
+    """
+    if isinstance(env, Recipe):
+        return env
     name = full_id(env) if isinstance(env, str) else env or about.get("env")
     if name is not None and not isinstance(name, str):
         raise UsageError(f"env: must be an id such as HalfCheetah-v5, got a {type(name).__name__}")
     if name is None:
         raise UsageError("env: the policy names no env; give one with --env")
-    require("env", name, [env])
+    require("env", name, [env, *allow])
     own = about if name == about.get("env") else {}
     for wrapper in own.get("wrap", ()):
-        require("wrap", wrapper)
+        require("wrap", wrapper, allow)
     kwargs = own.get("env_kwargs", {}) if env_kwargs is None else env_kwargs
     return Recipe(name, kwargs, tuple(own.get("wrap", ())), bool(own.get("renew_env")))
 

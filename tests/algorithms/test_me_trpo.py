@@ -442,8 +442,8 @@ def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
     while trainer.progress.step < trainer.budget:
         trainer.loop.tick()
         told = trainer.loop.training_values()
-        searched += told["policy_updates"]
-        fitted += told["model_epochs"]
+        searched += told["search_updates"]
+        fitted += told["fit_epochs"]
     found = trainer.ledger()
     trainer.close()
     assert found["updates"] == 3
@@ -451,3 +451,10 @@ def test_ledger_counts_what_the_search_spent(tmp_path: Path) -> None:
     assert found["policy_updates"] == searched > 0
     assert found["model_epochs"] == fitted > 0
     assert found["imagined_steps"] == searched * SMALL["imagined_steps"]
+
+
+def test_refuses_episodes_longer_than_all_imagined_steps() -> None:
+    for given in ({"imagined_steps": 200}, {"imagined_steps": 200, "horizon": 201}):
+        with pytest.raises(UsageError, match=r"horizon.*up to 200"):
+            resolve("me-trpo", "Swimmer-v5", given)
+    assert resolve("me-trpo", "Swimmer-v5", {"imagined_steps": 200, "horizon": 200})

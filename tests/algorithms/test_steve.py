@@ -12,7 +12,7 @@ from learners import NETWORKS, fresh, learner
 from numeric import KEY, SPEC, random_batch, same, single
 from short_runs import TINY, run_to_end
 
-from pacesetter.algorithms.steve import STEVE, combine
+from pacesetter.algorithms.steve import STEVE, combine, deal
 from pacesetter.algorithms.steve_td3 import SteveTD3
 from pacesetter.algorithms.td3 import State
 from pacesetter.batch import Batch
@@ -169,6 +169,9 @@ def test_without_horizon_it_is_its_base(name: str, base: str) -> None:
         assert_equal_networks(ours, theirs)
         assert same(mine.td_error, other.td_error)
         assert mine.losses["model_use"] == 0
+        assert "model_loss" not in mine.losses
+    assert same(ours.models, fresh(steve, 3).models)  # which nothing asks
+    assert steve.ledger([], 10, 0) == {"model_updates": 0, "imagined_transitions": 0}
 
 
 @pytest.mark.slow
@@ -230,6 +233,17 @@ def test_each_model_and_critic_learns_from_rows_of_its_own(
     )
     for index, moved in ((0, False), (1, True)):
         assert same(*[jax.tree.map(lambda x, i=index: x[i], c) for c in (one, two)]) != moved
+
+
+def test_every_row_is_dealt_to_a_model() -> None:
+    """Also where they do not divide a minibatch: each model's weighted mean is that of its rows."""
+    batch = rows(8)
+    for count in (1, 3, 4, 8):
+        hands = jax.device_get(deal(batch, count))
+        means = (hands.weight * hands.reward).mean(axis=1)
+        parts = [slice(model, None, count) for model in range(count)]
+        expected = [(batch.weight[own] * batch.reward[own]).mean() for own in parts]
+        np.testing.assert_allclose(means, expected, rtol=1e-6)
 
 
 def test_pairs_of_twins_share_their_rows() -> None:

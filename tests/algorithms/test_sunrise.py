@@ -532,3 +532,17 @@ def test_settings_of_the_base_keep_their_defaults(name: str) -> None:
     ours, base = (resolve(each, "HalfCheetah-v5").hyper for each in (name, BASES[name]))
     for setting in vars(base):
         assert getattr(ours, setting) == getattr(base, setting), setting
+
+
+@both
+def test_a_row_is_as_urgent_as_it_is_to_those_that_train_on_it(name: str) -> None:
+    """A learner that is masked out gains nothing from the row, however wrong it is there."""
+    ours = learner(name, ensemble=2)
+    state = begin(ours)
+    wrong = jax.tree.map(lambda x: x.at[0].set(x[0] + 1_000 * (x.ndim == 3)), state.critic)
+    state = state._replace(critic=wrong)
+    key, batches = jax.random.key(0), []
+    for mask in ([0.0, 1.0], [1.0, 1.0]):
+        batches.append(minibatches(ours.updates_per_call, 16, np.tile(mask, (16, 1))))
+    others, both_learn = (update(ours, state, batch, key).td_error[0] for batch in batches)
+    assert np.all(np.asarray(both_learn) > 10 * np.asarray(others))

@@ -94,3 +94,10 @@ def test_actor_climbs_the_mean_of_all_critics(rng: np.random.Generator) -> None:
 def test_what_cannot_be_is_refused(settings: dict[str, Any], line: str) -> None:
     with pytest.raises(UsageError, match=line):
         resolve("tqc", "Pendulum-v1", settings)
+
+
+@pytest.mark.parametrize("quantiles", [1, 2])
+def test_refuses_to_drop_all_quantiles_by_default_too(quantiles: int) -> None:
+    with pytest.raises(UsageError, match="dropped"):
+        resolve("tqc", "Walker2d-v5", {"quantiles": quantiles})
+    assert resolve("tqc", "Walker2d-v5", {"quantiles": quantiles, "dropped": 0})

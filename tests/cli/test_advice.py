@@ -93,3 +93,12 @@ def test_the_view_names_the_phase() -> None:
     assert view.phase == "training"
     trainer.progress.next_evaluation = 26_000
     assert view.phase == "evaluating"
+
+
+def test_blocks_of_updates_that_never_come() -> None:
+    """Steps after the warm-up that fill no block are not learned from either."""
+    blocks = {"steps": 199, "warmup": 100, "update_every": 100}
+    told = within_warmup(resolve("td3", TASK, blocks))
+    assert told is not None
+    assert "less than a block of 100" in told
+    assert within_warmup(resolve("td3", TASK, blocks | {"steps": 200})) is None

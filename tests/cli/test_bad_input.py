@@ -472,6 +472,7 @@ BAD_EVALS: dict[str, tuple[list[str], list[str]]] = {
     "episodes in words": (["--episodes", "ten"], ["episodes", "ten"]),
     "negative seed": (["--seed", "-1"], ["seed", "-1"]),
     "negative noise": (["--noise", "-0.1"], ["noise", "-0.1"]),
+    "noise of random actions": (["--noise", "0.1", "--random"], ["noise", "--random"]),
     "noise is NaN": (["--noise", "nan"], ["noise", "nan"]),
     "another task's sizes": (["--env", "Ant-v5"], ["Ant-v5", "105", "8", "3", "2"]),
     "unknown task": (["--env", "Antt-v5"], ["env", "Antt-v5", "Ant-v5"]),
@@ -633,6 +634,19 @@ def test_list_goes_on_after_a_damaged_run(
     lines = capsys.readouterr().out.splitlines()
     assert any(str(run.path) in line and "settings.steps is missing" in line for line in lines)
     assert any(str(copy) in line and "of 700" in line for line in lines)
+
+
+def test_names_of_folders_reach_no_terminal_raw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "\x1b[31mred" / "x" / "0"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text("{}")
+    for words in (["list"], ["list", "runs"]):
+        assert main([*words, "--runs", str(tmp_path)]) == 0
+        shown = capsys.readouterr().out
+        assert "\x1b" not in shown
+        assert "31mred/x/0" in shown  # as one word, to copy
 
 
 def change(**settings: Any) -> Callable[[dict[str, Any]], object]:

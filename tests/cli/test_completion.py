@@ -22,6 +22,13 @@ TRIES: dict[tuple[str, ...], set[str]] = {
     ("list", "al"): {"algorithms"},
     ("export", "--to", ""): {"onnx", "minari", "sb3"},
     ("bench", "smo"): {"smoke"},
+    ("bench", "mine"): {"mine.toml"},
+    ("bench", "smoke", "--algos", "crossq-sm"): {"crossq-small"},
+    ("bench", "smoke", "--critic-h"): {"--critic-hidden"},
+    ("train", "td3", "Ant-v5", "--rule", "resc"): {"rescue"},
+    ("train", "td3", "Ant-v5", "--start-from", "Ant"): {"Ant-v5/td3/0"},
+    ("push", "--video", "mi"): {"mine.toml"},
+    ("show", "ru"): {"runs/"},
     ("completion", ""): {"bash", "zsh", "tcsh"},
 }
 ASK = """
@@ -39,12 +46,32 @@ def test_bash_completes(
     text = capsys.readouterr().out
     assert all(verb in text for verb in VERBS)
     Path("script.sh").write_text(text)
+    Path("mine.toml").touch()
     (tmp_path / "runs" / "Ant-v5" / "td3" / "0").mkdir(parents=True)
     lines = [f"try {' '.join(repr(word) for word in words)}" for words in TRIES]
     done = subprocess.run(["bash", "-c", ASK + "\n".join(lines)], capture_output=True, text=True)
     assert done.stderr == ""
     found = [{*line.split()} for line in done.stdout.splitlines()]
     assert found == [*TRIES.values()]
+
+
+def test_bash_runs_nothing_of_a_folders_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it completes is quoted, so that not even Enter after Tab would run it."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["completion", "bash"]) == 0
+    Path("script.sh").write_text(capsys.readouterr().out)
+    shown = 'source ./script.sh; _pacesetter_runs ""'
+    done = subprocess.run(["bash", "-c", shown], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("script.sh\n", "")  # without runs, no pattern
+    for folder in ("runs/E/$(touch run)/0", "$(touch file)"):
+        (tmp_path / folder).mkdir(parents=True)
+    done = subprocess.run(["bash", "-c", shown], capture_output=True, text=True)
+    typed = "".join(f"set -- {line}\n" for line in done.stdout.splitlines())
+    assert subprocess.run(["bash", "-c", typed]).returncode == 0
+    assert "E/\\$\\(touch\\ run\\)/0" in done.stdout
+    assert not {"run", "file"} & {path.name for path in tmp_path.iterdir()}
 
 
 @pytest.mark.parametrize("shell", ["zsh", "tcsh"])
@@ -54,6 +81,8 @@ def test_other_shells_read_theirs(
     assert main(["completion", shell]) == 0
     text = capsys.readouterr().out
     assert "--critic-layer-norm" in text or "critic-layer-norm" in text
+    assert "MODULE:CLASS" not in text
+    assert shell == "zsh" or "'n/show/f/'" in text.replace("*", "")
     if shutil.which(shell):
         (tmp_path / "script").write_text(text)
         done = subprocess.run([shell, "-n", tmp_path / "script"], capture_output=True, text=True)

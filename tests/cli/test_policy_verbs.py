@@ -195,6 +195,7 @@ def test_push_hands_over_what_was_typed(
     assert main(["push", str(pendulum), "me/swing", *flags]) == 0
     assert capsys.readouterr().out == "https://there\n"
     how = {"video": "a.mp4", "private": True, "episodes": 3, "seed": 2, "env": None}
+    how["env_kwargs"] = load(pendulum).about.get("env_kwargs", {})
     double.assert_called_once_with(pendulum, "me/swing", **how)
 
 

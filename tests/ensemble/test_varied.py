@@ -242,3 +242,10 @@ def test_settings_of_a_stopped_run_go_on(runs: Path) -> None:
 def test_refuses_gammas_whose_returns_leave_the_bins() -> None:
     with pytest.raises(UsageError, match="vary: gamma cannot differ with --bins"):
         resolve("crossq-bins", "Pendulum-v1", {"members": 2, "vary": {"gamma": (0.98, 0.99)}})
+
+
+def test_refuses_noise_on_weights_that_differs() -> None:
+    """Its deviation adapts, and goes with the networks that are copied."""
+    noisy = {"exploration": "parameter", "actor_layer_norm": True, "members": 2}
+    with pytest.raises(UsageError, match="vary: exploration_noise cannot differ"):
+        resolve("td3", "Pendulum-v1", noisy | {"vary": {"exploration_noise": (0.05, 0.4)}})

@@ -124,3 +124,66 @@ def test_a_call_that_hangs_in_c_ends_the_process() -> None:
         "pacesetter: stopped: Robot-v0: step: failed: "
         "it has not returned after 0.2 s and cannot be woken\n"
     )
+
+
+def test_limits_within_limits() -> None:
+    """The earlier end counts, and the outer one is there again when the inner has ended."""
+
+    def outer(inner: float) -> None:
+        call("reset", inner, lambda: 7)
+        stubborn()
+
+    for inner in (0.1, 60.0):
+        with pytest.raises(TaskError, match=r"renewal: .*0.3 s"):
+            call("renewal", 0.3, outer, inner)
+    with pytest.raises(TaskError, match=r"renewal: "):
+        call("renewal", 0.3, lambda: call("reset", 60.0, stubborn))
+
+
+OTHER_THREAD_FIRST = """
+import threading, time
+from pacesetter.envs.limits import Overdue, limited
+
+def wait(seconds):
+    with limited(seconds, "call"):
+        time.sleep(0.1)
+
+thread = threading.Thread(target=wait, args=[60])
+thread.start()
+thread.join()
+try:
+    with limited(0.2, "call"):
+        time.sleep(60)
+except Overdue:
+    print("woken")
+"""
+
+
+def test_a_call_is_woken_whichever_thread_had_the_first() -> None:
+    words = [sys.executable, "-c", OTHER_THREAD_FIRST]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr, done.returncode) == ("woken\n", "", 0)
+
+
+HANGS_BESIDE = """
+import threading, time
+from pacesetter.envs import limits
+
+limits.GRACE = 0.5
+
+def hang():
+    with limits.limited(0.3, "hung"):
+        time.sleep(60)
+
+threading.Thread(target=hang, daemon=True).start()
+for _ in range(100):
+    with limits.limited(60, "quick"):
+        time.sleep(0.05)
+"""
+
+
+def test_a_quick_call_lifts_no_limit_of_another_thread() -> None:
+    words = [sys.executable, "-c", HANGS_BESIDE]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.startswith("pacesetter: stopped: hung: it has not returned after 0.3 s")

@@ -7,7 +7,7 @@ import jax
 import pytest
 from short_runs import TINY, assert_same, run_to_end
 
-from pacesetter.learner.backend import NUMERICS
+from pacesetter.learner.backend import NUMERICS, made_with, prepare
 from pacesetter.training.trainer import Trainer
 
 PROBE = "broken_envs:Probe-v0"
@@ -48,3 +48,14 @@ def test_libraries_that_are_told_otherwise_are_on_record(
     trainer = Trainer("td3", PROBE, runs=tmp_path, **TINY, steps=150)
     trainer.close()
     assert trainer.directory.record()["numerics"] == NUMERICS | {"NVIDIA_TF32_OVERRIDE": "0"}
+
+
+def test_a_device_is_that_of_one_run() -> None:
+    """The next run, with `auto`, has JAX's own choice again; the record says where updates run."""
+    try:
+        prepare("cpu")
+        assert jax.config.values["jax_default_device"] is not None
+        assert made_with("xla")["backend"] == "cpu"
+    finally:
+        prepare("auto")
+    assert jax.config.values["jax_default_device"] is None

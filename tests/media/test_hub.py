@@ -176,3 +176,14 @@ def test_verb_plays_the_wrapped_task_and_no_other(
     assert (folder / "someone" / "half" / "README.md").exists()
     assert main([*words, "--wrap", "odd_envs:Raised", "--allow", name]) == 2
     assert "wrap: the card tells of the task" in capsys.readouterr().err
+    untrained("HalfCheetah-v4", algorithm="td3", step=5).save(tmp_path / "v4.safetensors")
+    words = ["push", str(tmp_path / "v4.safetensors"), "someone/v4", "--episodes", "1"]
+    for other in (["--env", "HalfCheetah-v5"], ["--env.max_episode_steps", "9"]):
+        assert main([*words, *other]) == 2
+        assert "env: the card tells of the task" in capsys.readouterr().err
+    assert not (folder / "someone" / "v4").exists()
+    short = {"max_episode_steps": 9}
+    untrained("HalfCheetah-v4", algorithm="td3", step=5, env_kwargs=short).save(
+        tmp_path / "v4.safetensors"
+    )
+    assert main([*words, "--env", "HalfCheetah-v4"]) == 0

@@ -21,7 +21,7 @@ from pacesetter.errors import TaskError, UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media.caption import caption
 from pacesetter.media.curve import curve
-from pacesetter.media.record import INSTALL, record
+from pacesetter.media.record import INSTALL, duration, record
 from pacesetter.media.scene import draw, scene
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
@@ -109,6 +109,33 @@ def test_camera_follows_the_walker_far_from_the_start(cheetah: Policy) -> None:
 
 
 @pytest.mark.usefixtures("gl")
+def test_a_task_that_is_made_anew_is_filmed_alike(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Size, camera and floor are those of a task that is kept."""
+    films: list[list[Any]] = []
+    for renew in (False, True):
+        cheetah.about["renew_env"] = renew
+        path = tmp_path / f"{renew}.gif"
+        kwargs = {"max_episode_steps": 3}
+        record(cheetah, path, episodes=2, size=(64, 48), env_kwargs=kwargs, text=False)
+        films.append(frames_of(path, monkeypatch)[0])
+    kept, renewed = films
+    assert kept[0].shape[:2] == (48, 64)
+    assert len(kept) == len(renewed)
+    for one, other in zip(kept, renewed, strict=True):
+        assert one.shape == other.shape
+        assert np.abs(one.astype(int) - other).mean() < 1  # of 256; a light may lag at a reset
+
+
+@pytest.mark.parametrize("rate", [20.0, 30.0, 125 / 3, 50.0])
+def test_frames_of_a_gif_add_up_to_its_time(rate: float) -> None:
+    durations = [duration(number, rate) for number in range(200)]
+    assert min(durations) >= 20
+    assert abs(sum(durations) - 1000 * 200 / rate) <= 10
+
+
+@pytest.mark.usefixtures("gl")
 def test_an_old_film_that_is_freed_late_leaves_a_new_one_alone(
     cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -116,18 +143,18 @@ def test_an_old_film_that_is_freed_late_leaves_a_new_one_alone(
     from pacesetter.media import scene as stage
 
     kept: list[Any] = []
-    leave, draw = stage.leave, stage.draw
+    close, draw = stage.Stage.close, stage.draw
 
-    def leave_and_keep(world: Any) -> None:
+    def close_and_keep(world: Any) -> None:
         kept.append(world.env.unwrapped)
-        leave(world)
+        close(world)
 
     def draw_and_forget(world: Any) -> Any:
         frame = draw(world)
         kept.clear()
         return frame
 
-    monkeypatch.setattr(stage, "leave", leave_and_keep)
+    monkeypatch.setattr(stage.Stage, "close", close_and_keep)
     record(cheetah, tmp_path / "old.gif", frames=2, size=(32, 32))
     monkeypatch.setattr(film, "draw", draw_and_forget)
     record(cheetah, tmp_path / "new.mp4", frames=4, size=(320, 240))

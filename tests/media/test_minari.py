@@ -4,8 +4,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 from policies import untrained
 
 from pacesetter.errors import UsageError
@@ -65,6 +67,18 @@ def test_a_folder_may_be_relative(
     export(pendulum, "minari", Path(folder) / "near-v0", episodes=1)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / folder))
     assert minari.load_dataset("near-v0").total_steps == 30
+
+
+def test_a_task_that_is_registered_by_its_class(tmp_path: Path) -> None:
+    """Its making cannot be written down, its spaces can."""
+    gymnasium.register("ByClass-v0", entry_point=PendulumEnv, max_episode_steps=20)
+    try:
+        export(untrained("ByClass-v0"), "minari", tmp_path / "class-v0", episodes=1)
+    finally:
+        del gymnasium.registry["ByClass-v0"]
+    data = minari.MinariDataset(tmp_path / "class-v0" / "data")
+    assert data.total_steps == 20
+    assert (data.observation_space.shape, data.action_space.shape) == ((3,), (1,))
 
 
 def _seed(data: Any, number: int) -> int:

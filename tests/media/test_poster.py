@@ -9,6 +9,7 @@ from PIL import Image
 from policies import untrained
 
 from pacesetter import load
+from pacesetter.envs import Environment
 from pacesetter.errors import UsageError
 from pacesetter.media.poster import GAP, period, poster
 from pacesetter.media.scene import draw, scene
@@ -112,3 +113,19 @@ def test_a_poster_that_fails_leaves_the_one_before(
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [
         (file.name, b"of yesterday")
     ]
+
+
+@pytest.mark.usefixtures("gl")
+def test_no_poster_of_a_task_that_does_not_repeat(
+    cheetah: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its pictures would be of another episode than their steps."""
+    reset, lengths = Environment.reset, iter(range(100))
+
+    def restless(world: Environment, episode: int | None = None) -> Any:
+        return reset(world, next(lengths))
+
+    monkeypatch.setattr(Environment, "reset", restless)
+    with pytest.raises(UsageError, match="does not repeat an episode"):
+        poster(cheetah, tmp_path / "strip.png", size=(64, 48))
+    assert not (tmp_path / "strip.png").exists()

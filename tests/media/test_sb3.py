@@ -1,6 +1,8 @@
 """What Stable-Baselines3 calls a model: `predict` with its arguments, shapes and units."""
 
+import os
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -124,7 +126,34 @@ def test_a_policy_file_cannot_put_code_into_the_script(tmp_path: Path) -> None:
 def test_script_makes_the_task_that_was_asked_for(pendulum: Policy, tmp_path: Path) -> None:
     path = tmp_path / "pendulum.py"
     export(pendulum, "sb3", path, env="Pendulum-v1", env_kwargs={"g": 1.0})
-    assert "'Pendulum-v1', **{'g': 1.0}" in path.read_text()
+    assert "Recipe('Pendulum-v1', {'g': 1.0}).make()" in path.read_text()
     wrapped = Recipe("Pendulum-v1", {}, ("my_mod:Half",))
-    with pytest.raises(UsageError, match="wrap: the script makes the plain task, without my_mod"):
-        export(pendulum, "sb3", tmp_path / "other.py", env=wrapped)
+    export(pendulum, "sb3", tmp_path / "other.py", env=wrapped)
+    assert (
+        "Recipe('Pendulum-v1', {}, ('my_mod:Half',)).make()" in (tmp_path / "other.py").read_text()
+    )
+
+
+@pytest.mark.parametrize("env", ["odd_envs:Goal-v0", "pacesetter/Ant111-v4"])
+def test_script_makes_tasks_that_gymnasium_alone_would_not(tmp_path: Path, env: str) -> None:
+    """One with Dict observations, and one of pacesetter's own, in a process of its own."""
+    path = tmp_path / "task.py"
+    export(untrained(env), "sb3", path, env=env)
+    (line,) = [line.strip() for line in path.read_text().splitlines() if "Monitor(" in line]
+    code = (
+        "from task import model; from pacesetter.envs import Recipe; Monitor = lambda env: env; "
+        f"{line}; env.step(model.predict(env.reset(seed=0)[0])[0])"
+    )
+    helpers = str(Path(__file__).parents[1] / "helpers")
+    paths = {"PYTHONPATH": os.pathsep.join([str(tmp_path), helpers])}
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | paths)
+
+
+def test_script_is_refused_what_it_cannot_make(tmp_path: Path) -> None:
+    made = untrained("Pendulum-v1")
+    made.about["wrap"] = ["os:Half"]
+    with pytest.raises(UsageError, match=r"wrap: .*allow it with --allow os:Half"):
+        export(made, "sb3", tmp_path / "one.py")
+    made.about.update(wrap=[], env="function/env")
+    with pytest.raises(UsageError, match="given as a function"):
+        export(made, "sb3", tmp_path / "two.py")

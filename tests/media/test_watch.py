@@ -13,12 +13,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco import MujocoEnv
 from policies import untrained
 
 from pacesetter.errors import UsageError
 from pacesetter.media import watch as module
 from pacesetter.media.watch import watch
 from pacesetter.policy import Policy
+from pacesetter.process import Interrupted
 
 CHAMPION = Path(__file__).parents[2] / "champions" / "HalfCheetah-v4-sac.safetensors"
 
@@ -163,3 +165,36 @@ def test_page_steps_the_task_once_per_frame_skip_and_resets_it(
     monkeypatch.setattr(viser, "ViserServer", server)
     watch(policy, browser=True, port=9)
     assert (seen["host"], seen["port"], seen["server"]) == ("127.0.0.1", 9, "server")
+
+
+@pytest.mark.usefixtures("bare")
+def test_a_signal_that_ends_it_is_no_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the exit code tells of it."""
+    gymnasium.register("Shown-v1", entry_point=Shown)
+    monkeypatch.setenv("DISPLAY", ":0")
+
+    def stop(self: Policy, observation: Any) -> Any:
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setattr(Policy, "act", stop)
+    try:
+        with pytest.raises(Interrupted):
+            watch(untrained("Pendulum-v1"), env="Shown-v1")
+    finally:
+        del gymnasium.registry["Shown-v1"]
+
+
+@pytest.mark.usefixtures("bare")
+def test_a_window_keeps_the_pace_of_a_mujoco_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gymnasium's own windows for MuJoCo do not wait; the camera is set once per env."""
+    monkeypatch.setenv("DISPLAY", ":0")
+    slept: list[float] = []
+    followed: list[Any] = []
+    monkeypatch.setattr(module, "sleep", slept.append)
+    monkeypatch.setattr(module, "_follow", lambda world: followed.append(world.env))
+    monkeypatch.setattr(MujocoEnv, "render", lambda self: None)
+    policy = untrained("HalfCheetah-v5", env_kwargs={"max_episode_steps": 3}, renew_env=True)
+    watch(policy, episodes=2)
+    assert len(slept) == 6
+    assert 0.1 < slept[2] <= 0.15  # three steps of a twentieth of a second, of no length here
+    assert len({id(env) for env in followed}) == len(followed) == 3  # one of them for the check

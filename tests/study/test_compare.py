@@ -99,6 +99,11 @@ def test_what_is_not_found_is_one_line(runs: Path, word: str, said: str, tmp_pat
         ({"evaluations": [[0, [math.nan], 0, 0, 0, 0]]}, "evaluations.0.1: should be"),
         ({"evaluations": [[0, [], 0, 0, 0, 0]]}, "evaluations.0.1: "),
         ({"evaluations": [[0]]}, "damaged or foreign"),
+        ({"selections": [[5, 0.0, 1.0, [0], 9]]}, "champion must be of 1 members"),
+        ({"varied": [{"gamma": [0.9]}, {"gamma": [0.9]}]}, "varied: must have a row"),
+        ({"varied": [{"gamma": [0.9, 0.8]}]}, "1 values of each setting"),
+        ({"varied": [{"gamma": "high"}]}, "varied.0.gamma"),
+        ({"resumed": [{"versions": 3}]}, "resumed.0.versions"),
         ({"settings": {}}, "is missing"),
     ],
 )
@@ -359,6 +364,9 @@ def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path
     (run,) = gather([path]).runs
     assert run.metric("max") < 800
     assert run.reached(1_000) == math.inf
+    early = run.cut(30_000)
+    assert early.metric("final") == early.returns[-1] < 800
+    assert run.cut(20_000).metric("final") == pytest.approx(1_001)  # there is no other
 
 
 def test_every_cell_of_the_paper_has_its_version_and_a_file_has_one_ledger(runs: Path) -> None:
@@ -708,3 +716,72 @@ def test_speed_of_a_run_that_made_no_step_is_not_known(tmp_path: Path) -> None:
         small(tmp_path, seed=seed)
     (row,) = contents.speed(compare([tmp_path], budget="100")).rows
     assert [cell.text for cell in row[-2:]] == ["-", "-"]
+
+
+def test_settings_that_end_a_run_are_checked(runs: Path) -> None:
+    line = compact(RunDirectory(runs / "Ant-v5" / "td3" / "0"))
+    line["settings"]["stop_at"] = "5"
+    Path("r.jsonl").write_text(json.dumps(line) + "\n")
+    assert "stop_at" in gather(["r.jsonl"]).damaged[0]
+
+
+def test_what_resumed_a_run_is_told(tmp_path: Path) -> None:
+    """Another machine, commit or library in a later session is noted as one of another run is."""
+    path = small(tmp_path)
+    config = json.loads((path / "config.json").read_text())
+    config["resumed"] = [{"commit": "f" * 40, "machine": "another", "products": "onednn"}]
+    config["products"] = "xla"
+    (path / "config.json").write_text(json.dumps(config))
+    found = compare([tmp_path])
+    notes = " ".join(found.notes)
+    assert "several machines" in notes
+    assert "several libraries of matrix products" in notes
+    assert "2 commits" in notes
+    assert any("another" in line for line in contents.made_with(found))
+    assert "ffffffffffff" in contents.runs(found).rows[0][6].text
+
+
+def test_keywords_in_another_order_are_the_same_task(tmp_path: Path) -> None:
+    small(tmp_path, seed=0, env_kwargs={"a": 1, "b": 2})
+    small(tmp_path, seed=1, env_kwargs={"b": 2, "a": 1})
+    assert [len(group.runs) for group in compare([tmp_path]).groups] == [2]
+
+
+def test_a_schedule_that_is_cut_is_told(tmp_path: Path) -> None:
+    for seed in range(3):
+        small(tmp_path, seed=seed, lr_horizon=20_000, lr_end=0.1)
+    assert "schedule" not in " ".join(compare([tmp_path]).notes)
+    found = compare([tmp_path], budget=10_000)
+    assert "Cut before their schedule" in " ".join(found.notes)
+    (row,) = contrasts.best_of_two(compare([tmp_path]))[0].rows
+    assert row[4].text == "-"
+
+
+def test_results_are_collected_once_and_finished(tmp_path: Path) -> None:
+    """Of runs of one task, name and seed in two places, none is chosen silently."""
+    make_run(tmp_path / "runs", "Ant-v5", "td3", budget=200_000, evaluations=20)
+    make_run(tmp_path / "runs", "Ant-v5", "sac", budget=10_000, evaluations=5, planned=20_000)
+    script = (ROOT / "results" / "summary.py").read_text()
+    (tmp_path / "results").mkdir()
+    copy = tmp_path / "results" / "summary.py"
+    copy.write_text(script)
+
+    def collect(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(copy), "--study", "pilot", "--collect", "pilot", *words]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    done = collect("runs")
+    assert "left out as unfinished: runs/Ant-v5/sac/0" in done.stderr
+    names = [json.loads(line)["settings"]["name"] for line in _lines(copy)]
+    assert names == ["td3"]
+    collect("runs", "--unfinished")
+    assert len(_lines(copy)) == 2
+    small(tmp_path / "runs" / "other")
+    done = collect("runs")
+    assert done.returncode == 1
+    assert "of the same task, name and seed" in done.stderr
+    assert len(_lines(copy)) == 2
+
+
+def _lines(script: Path) -> list[str]:
+    return script.with_name("pilot.jsonl").read_text().splitlines()

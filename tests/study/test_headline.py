@@ -62,3 +62,15 @@ def test_single_runs_are_not_told_apart_by_an_interval(tmp_path: Path) -> None:
     for env in ("Ant-v5", "Walker2d-v5"):
         runs(tmp_path, {"td3": 1_000, "sac": 2_000}, 1, env)
     assert "sac is of too few runs to tell on 2 of 2 tasks" in headline(compare([tmp_path]))
+
+
+def test_what_is_not_known_is_not_ranked(tmp_path: Path) -> None:
+    """A largest return is of evaluations after the first update, which some runs never had."""
+    runs(tmp_path, {"td3": 1_000, "sac": 2_000}, 1)
+    line = headline(compare([tmp_path], metric="max"))
+    assert line == "No maximum return is known: no evaluation came after a first update."
+    make_run(tmp_path, "Ant-v5", "ddpg", budget=100_000, evaluations=10)
+    line = headline(compare([tmp_path], metric="max", mixed=True))
+    assert line.startswith("ddpg on Ant-v5 has a maximum return of")
+    assert "Not known, without an evaluation after the first update: sac on Ant-v5, td3" in line
+    assert "inf" not in line

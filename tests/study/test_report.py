@@ -283,6 +283,24 @@ def test_the_champions_film_is_in_the_page(runs: Path, tmp_path: Path) -> None:
     assert "the policy of step 100,000" in text
 
 
+def test_a_film_of_a_wrapped_task_is_made_if_it_is_allowed(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[Any] = []
+    monkeypatch.setattr(
+        "pacesetter.media.record.record",
+        lambda policy, path, env, **how: (played.append(env), path.write_bytes(b"x")),
+    )
+    run = shutil.copytree(runs / "Walker2d-v5", tmp_path / "runs" / "Walker2d-v5")
+    wrap = ["wrapper_that_nobody_imports:Half"]
+    for config in run.rglob("config.json"):
+        untrained("Walker2d-v5", wrap=wrap).save(config.parent / "policy.safetensors")
+    assert "allow it with --allow" in write(tmp_path / "a.html", tmp_path / "runs")
+    text = write(tmp_path / "b.html", tmp_path / "runs", "--allow", wrap[0])
+    assert "<video" in text
+    assert [env.wrap for env in played] == [tuple(wrap)]
+
+
 @pytest.mark.parametrize("kind", [UsageError, TaskError])
 def test_a_page_without_a_film_says_why_in_one_line(
     kind: type[Exception], runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -111,9 +111,12 @@ def test_a_study(undisturbed: list[Any]) -> None:
 
 
 def test_score_is_the_mean_of_the_last_evaluations() -> None:
-    rows = [{"kind": "eval", "step": 10 * i, "mean": float(i**2)} for i in range(51)]
+    rows = [{"kind": "eval", "step": 10 * i, "mean": float(i**2), "updates": i} for i in range(51)]
     rows.insert(3, {"kind": "train", "step": 5})
     assert tune._score(rows[:3]) == (1 + 4) / 2
+    idle = [row | {"updates": 0} for row in rows[:2]]
+    assert tune._score(idle) == 1  # of step 10; there is no other
+    assert tune._score([*idle, *rows[2:4]]) == 4
     assert tune._score(rows[:12]) == (8**2 + 9**2 + 10**2) / 3
     assert tune._score(rows) == sum(i**2 for i in range(46, 51)) / 5
 

@@ -1,10 +1,12 @@
 """`--log`: each tracker holds what the log holds, whatever happened to the run in between."""
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -240,3 +242,33 @@ def test_bench_passes_it_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert line.count("--log=tensorboard -q") == 2
     assert main(bench) == 0
     assert "--log" not in capsys.readouterr().out
+
+
+def test_a_number_that_is_none_gives_no_point() -> None:
+    row = {"kind": "eval", "step": 1, "terms": {"reward_x": math.nan, "reward_y": math.inf}}
+    assert numbers(row | {"mean": 2.0, "returns": [1.0, math.nan]}) == {
+        "eval/mean": 2.0,
+        "eval/returns/0": 1.0,
+    }
+
+
+def test_wandb_takes_a_step_as_a_whole(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It drops what comes later for a step that it has, so a stopped run keeps back its last."""
+    logged: list[tuple[int, dict[str, float]]] = []
+    run = SimpleNamespace(log=lambda row, step: logged.append((step, row)), finish=lambda: None)
+    tool = SimpleNamespace(init=lambda **given: run, Settings=lambda **given: None)
+    monkeypatch.setattr("pacesetter.tracking.sinks.need", lambda *names: tool)
+
+    def steps(rows: list[Row], new: list[Row]) -> list[int]:
+        logged.clear()
+        with SINKS["wandb"].open(Tracked(tmp_path, "a", "t", "g", {}, rows, False)) as write:
+            for row in new:
+                write(row)
+        return [step for step, _ in logged]
+
+    def row(kind: str, step: int) -> Row:
+        return {"kind": kind, "step": step, "updates": 1}
+
+    first = [row("eval", 0), row("train", 1000)]
+    assert steps([], first) == [0]  # stopped within the evaluation of step 1000
+    assert steps(first, [row("eval", 1000)]) == [0, 1000, 1000]

@@ -34,6 +34,7 @@ from pacesetter.policy import Policy
 from pacesetter.process import stopping
 from pacesetter.replay import buffer
 from pacesetter.runs import RunDirectory, find_all
+from pacesetter.training import checkpoint
 from pacesetter.training.trainer import Trainer
 
 FLAGS = ["--hidden", "16", "16", "--batch-size", "16", "--warmup", "200", "--replay-size", "300"]
@@ -233,6 +234,20 @@ def late(runs: Path, **settings: Any) -> Trainer:
     return Trainer("td3", "broken_envs:Late-v0", runs=runs, **settings)
 
 
+def test_a_tick_that_a_fault_broke_off_ends_before_an_evaluation(
+    tmp_path: Path, disarmed: None
+) -> None:
+    """With three members, step 100 lies within a tick: its evaluation comes at 102."""
+    settings: dict[str, Any] = {"members": 3, "eval_every": 100, "steps": 300}
+    whole = run_to_end(late(tmp_path / "whole", **settings))
+    Late.arm("error", victim=1, at=34)
+    trainer = late(tmp_path / "faulty", **settings)
+    with pytest.raises(TaskError, match="member 1, step 100"):
+        run_to_end(trainer)
+    Late.disarm()
+    assert_same(whole, run_to_end(Trainer.resume(trainer.directory.path)))
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_fault_of_env_stops_the_run(
     fault: str,
@@ -368,3 +383,46 @@ def test_fault_in_a_loss(
         run_to_end(trainer)
     resumed = run_to_end(Trainer.resume(trainer.directory.path))
     assert_same(whole, resumed)
+
+
+@pytest.mark.parametrize("algorithm", ["td3", "trpo"])
+def test_the_first_fault_is_the_one_that_is_told(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A simulator that crashed cannot be closed either; the other envs are closed all the same."""
+    few: dict[str, Any] = {**TINY, "members": 3}
+    if algorithm == "trpo":
+        few = {"parallel_envs": 3, "rollout_length": 50, "eval_every": 300, "eval_episodes": 1}
+    trainer = Trainer(algorithm, "broken_envs:Probe-v0", runs=tmp_path, steps=300, **few)
+    closed: list[Any] = []
+
+    def crash(self: Any, action: Any) -> Any:
+        raise RuntimeError("a bolt fell out")
+
+    def close(self: Any) -> None:
+        closed.append(self)
+        raise RuntimeError("the door is stuck")
+
+    monkeypatch.setattr(broken_envs.Probe, "step", crash)
+    monkeypatch.setattr(broken_envs.Probe, "close", close)
+    with pytest.raises(TaskError, match=r"step 0: .*a bolt fell out"):
+        run_to_end(trainer)
+    assert len(closed) >= 3
+    assert not trainer.directory.in_use()
+
+
+def test_a_break_that_cannot_save_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python passes over what is raised when a loop is left, so a line says it."""
+    trainer = Trainer("td3", "broken_envs:Probe-v0", runs=tmp_path, **TINY, steps=300)
+
+    def full(*given: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "save", full)
+    for _ in trainer:
+        break
+    assert capsys.readouterr().err == (
+        "pacesetter: not saved: OSError: [Errno 28] No space left on device\n"
+    )

@@ -58,6 +58,22 @@ def test_every_member_starts_with_the_champion_of_a_run(runs: Path, algorithm: s
     run_to_end(new)
 
 
+def test_the_ledger_starts_anew(runs: Path) -> None:
+    """ME-TRPO counts in its state what its searches and fits have cost."""
+    tiny: dict[str, Any] = {
+        "steps": 500, "known": False, "hidden": (8,), "models": 2, "model_hidden": (8,),
+        "model_rows": 1_000, "imagined_steps": 100, "horizon": 20, "policy_updates": 2,
+        "check_every": 2, "rollout_length": 250, "eval_every": 500, "eval_episodes": 1,
+    }  # fmt: skip
+    old = Trainer("me-trpo", ENV, runs=runs, **tiny)
+    run_to_end(old)
+    assert old.ledger()["policy_updates"] > 0
+    source = str(old.directory.path)
+    new = Trainer("me-trpo", ENV, runs=runs, name="new", start_from=source, **tiny)
+    assert {new.ledger()[name] for name in ("policy_updates", "model_epochs")} == {0}
+    run_to_end(new)
+
+
 @pytest.mark.parametrize("algorithm", ["td3", "sac", "ddpg"])
 def test_a_policy_file_gives_the_actor(runs: Path, algorithm: str) -> None:
     """The new run acts as the file does, before it has learned anything."""
@@ -82,6 +98,34 @@ def test_a_run_does_not_need_its_source_again(runs: Path) -> None:
     assert_same(whole, run_to_end(Trainer.resume(new.directory.path)))
 
 
+def test_a_run_that_was_killed_before_its_first_checkpoint_starts_there_again(runs: Path) -> None:
+    old = trained(runs).directory.path
+    new = Trainer("td3", ENV, runs=runs, start_from=str(old), name="new", **SHORT)
+    policy = new.policy()
+    new.close()
+    new.directory.state_file.unlink()
+    again = Trainer.resume(new.directory.path)
+    observations = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    assert np.array_equal(again.policy()(observations), policy(observations))
+    again.close()
+
+
+def test_policies_that_are_kept_are_those_of_the_log(runs: Path) -> None:
+    """Not of evaluations that a killed run made after its checkpoint; a user's files stay."""
+    settings = {**SHORT, "steps": 300, "eval_every": 100, "checkpoint_every": 3600, "keep": 1}
+    trainer = Trainer("td3", ENV, runs=runs, **settings)
+    trainer.save = lambda: None
+    for report in trainer:
+        if report.kind == "eval" and report.step == 300:
+            break
+    folder = trainer.directory.policies
+    mine = folder / "step-100-best.safetensors"
+    mine.touch()
+    assert (folder / "step-300.safetensors").exists()
+    run_to_end(Trainer.resume(trainer.directory.path, steps=250))
+    assert {file.name for file in folder.iterdir()} == {mine.name, "step-250.safetensors"}
+
+
 def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: Path) -> None:
     old = trained(runs)
     file, run = old.directory.policy_file, old.directory.path
@@ -97,6 +141,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: P
         (file, {"algorithm": "crossq-small"}, "CrossQ cannot take the actor of a policy file"),
         (file, {"algorithm": "td7-small"}, "TD7 cannot take the actor of a policy file"),
         (scaled, {}, "acts on normalized observations"),
+        (file, {"normalize_observation": True}, "acts on the task's own observations"),
         (damaged, {}, "damaged"),
         (tmp_path / "none.safetensors", {}, "none.safetensors"),
         ("nowhere", {}, "'nowhere' not found"),

@@ -92,6 +92,10 @@ class Learner:
         """What so many updates and actions cost besides the members' own; nothing by default."""
         return {}
 
+    def restarted(self, state: State) -> State:
+        """The state of an earlier run without what it counted for its ledger (`--start-from`)."""
+        return state
+
     def with_actor(self, state: State, layers: Layers) -> State:
         """The state with the actor of a policy file (`--start-from FILE`)."""
         raise UsageError(

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 import jax
 import jax.numpy as jnp
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass as settings
 
 from pacesetter.algorithms import trpo
@@ -29,6 +29,13 @@ from pacesetter.policy import OBSERVATION_LIMIT, Actors
 from pacesetter.settings import STRICT, ModelDriven, only
 from pacesetter.settings.values import Count, Width
 from pacesetter.types import Floats
+
+
+def _fits(horizon: int, info: ValidationInfo) -> int:
+    """A policy update needs at least one imagined episode."""
+    if horizon > (steps := info.data.get("imagined_steps", horizon)):
+        raise ValueError(f"is longer than all imagined steps; allowed: up to {steps}")
+    return horizon
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -50,8 +57,12 @@ class Hyper(ModelDriven, trpo.Hyper):
     model_patience: int = Field(5, ge=1, description="passes without a fall that end a fit")
     model_rows: Count = Field(250_000, ge=1, description="rows that a fit goes through at most")
     renew_every: int = Field(0, ge=0, description="iterations from new networks to new; 0: never")
-    imagined_steps: Count = Field(20_000, ge=1, description="imagined steps of a policy update")
-    horizon: int = Field(1000, ge=1, description="longest imagined episode")
+    imagined_steps: Count = Field(
+        20_000, ge=1, description="imagined steps of a policy update, in whole episodes at most"
+    )
+    horizon: Annotated[int, AfterValidator(_fits)] = Field(
+        1000, ge=1, validate_default=True, description="longest imagined episode"
+    )
     bootstrap: bool = Field(True, description="the critic's value counts at the horizon")
     policy_updates: int = Field(50, ge=1, description="policy updates of an iteration at most")
     check_every: int = Field(5, ge=1, description="policy updates between checks in all models")
@@ -132,7 +143,7 @@ class METRPO(Learner):
         starts: Any = batch.starts
         models, epochs, losses = self.fit_models(state, batch, fit_key)
         search = self.search(state.learner, models, starts, search_key)
-        losses |= {"imagined_return": search.returns.mean(), "policy_updates": search.made * 1.0}
+        losses |= {"imagined_return": search.returns.mean(), "search_updates": search.made * 1.0}
         learner = search.learner._replace(actor=search.kept)
         searched, fitted = state.searched + search.made, state.fitted + epochs
         new = State(learner, models, state.updates + 1, searched, fitted)
@@ -147,6 +158,11 @@ class METRPO(Learner):
             "imagined_steps": searched * self.imagined_envs * hyper.horizon,
             "model_epochs": int(state.fitted),
         }
+
+    def restarted(self, state: State) -> State:
+        return state._replace(
+            searched=jnp.zeros_like(state.searched), fitted=jnp.zeros_like(state.fitted)
+        )
 
     @property
     def imagined_envs(self) -> int:
@@ -177,7 +193,7 @@ class METRPO(Learner):
         found = fit(
             self.dynamics, models, data, key, hyper.model_batch_size, hyper.model_patience, epochs
         )
-        losses = {"model_loss": found.loss.mean(), "model_epochs": found.epochs * 1.0}
+        losses = {"model_loss": found.loss.mean(), "fit_epochs": found.epochs * 1.0}
         return found.models, found.epochs, losses
 
     def search(self, learner: trpo.State, models: Models, starts: Array, key: Array) -> Search:

@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo
 from pydantic.dataclasses import dataclass as settings
 
@@ -130,12 +131,14 @@ class Expansion(td3.TD3):
 
     def critic_step(self, state: Any, batch: Batch, key: Array) -> tuple[Any, Any]:
         """Fit the models, then move every critic towards the expanded target on its own rows."""
-        state, model_loss = self.fit_models(state, batch)
+        told: dict[str, Array] = {}
+        if self.hyper.horizon:
+            state, told["model_loss"] = self.fit_models(state, batch)
         target_q, weights = self.expanded_target(state, batch, key)
         own = batch.weight * self.routes(len(target_q))
         state, loss, td_error = self.fit_critic(state, batch, target_q, own)
-        losses = {"critic_loss": loss, "model_loss": model_loss}
-        return state, (losses | {"model_use": 1 - weights[0].mean()}, td_error)
+        told |= {"critic_loss": loss, "model_use": 1 - weights[0].mean()}
+        return state, (told, td_error)
 
     def actor_value(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """The mean value (B,) by the first critic of every member."""
@@ -148,7 +151,8 @@ class Expansion(td3.TD3):
     def ledger(self, states: Sequence[Any], updates: int, actions: int) -> dict[str, int]:
         """Steps of the models' optimiser, and imagined transitions."""
         rows = self.hyper.batch_size * self.hyper.models * self.hyper.horizon
-        return {"model_updates": updates, "imagined_transitions": updates * rows}
+        fits = updates if self.hyper.horizon else 0
+        return {"model_updates": fits, "imagined_transitions": updates * rows}
 
     def copy_weights(self, own: Any, parent: Any) -> Any:
         return super().copy_weights(own, parent)._replace(models_opt_state=own.models_opt_state)
@@ -197,15 +201,29 @@ class Expansion(td3.TD3):
         """One Adam step of every model, each on every `models`-th row; their mean loss."""
         count = self.hyper.models
         models = self.dynamics.observe(state.models, batch)
-
-        def deal(x: Array) -> Array:
-            each = len(x) // count
-            return x[: each * count].reshape(each, count, *x.shape[1:]).swapaxes(0, 1)
-
         models, opt_state, loss = self.dynamics.step(
-            models, state.models_opt_state, jax.tree.map(deal, batch)
+            models, state.models_opt_state, deal(batch, count)
         )
         return state._replace(models=models, models_opt_state=opt_state), loss
+
+
+def deal(batch: Batch, count: int) -> Batch:
+    """Every `count`-th row of a minibatch for each model, (count, rows, ...).
+
+    A last round that is not full is filled up by rows of weight 0; the weights of the others then
+    grow, so that a mean over `rows` is the mean of a model's own.
+    """
+    size = len(batch.reward)
+    rows = -(-size // count)
+
+    def dealt(x: Array) -> Array:
+        return jnp.resize(x, (rows * count, *x.shape[1:])).reshape(rows, count, *x.shape[1:])
+
+    own = (np.arange(rows * count) < size).reshape(rows, count)
+    share = (own / own.mean(axis=0)).astype(np.float32)
+    hands = jax.tree.map(dealt, batch)
+    hands = hands._replace(weight=hands.weight * share)
+    return jax.tree.map(lambda x: x.swapaxes(0, 1), hands)
 
 
 def combine(candidates: Sequence[Array]) -> tuple[Array, Array]:

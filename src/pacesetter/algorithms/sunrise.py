@@ -142,7 +142,8 @@ class Sunrise(Learner):
         rows = batch.weight * weight * self.share(batch.mask)
         fit_critic = jax.vmap(self.base.fit_critic, (0, None, 0, 0))
         state, loss, td_error = fit_critic(state, batch, target_q, rows)
-        return state, (loss.mean(), td_error.max(axis=0), deviation, weight)
+        learned = jnp.where(batch.mask.T > 0, td_error, 0)  # by those that train on the row
+        return state, (loss.mean(), learned.max(axis=0), deviation, weight)
 
     def target(self, state: State, batch: Batch, keys: Array) -> tuple[Array, Array]:
         """Each learner's target (N, B); the next values' deviation (N, B), or one for all (B,)."""

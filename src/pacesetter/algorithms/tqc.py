@@ -36,7 +36,10 @@ class Hyper(sac.Hyper):
     critics: int = Field(5, ge=1, le=100, description="critics, whose quantiles the target pools")
     quantiles: int = Field(25, ge=1, le=1_000, description="quantiles that each critic learns")
     dropped: Annotated[int, AfterValidator(_check_dropped)] = Field(
-        2, ge=0, description="largest quantiles to drop from the target, per critic"
+        2,
+        ge=0,
+        validate_default=True,
+        description="largest quantiles to drop from the target, per critic",
     )
 
 

@@ -20,12 +20,15 @@ def within_warmup(config: "Config") -> str | None:
     """One line on a run that would never learn, as its budget ends within the warm-up."""
     hyper: Any = config.hyper
     steps, warmup = budget(config.settings()), getattr(hyper, "warmup", 0)
-    if steps > warmup or getattr(hyper, "warmup_updates", False):
+    each = getattr(hyper, "block", 1)
+    block = each * config.run.members if each > 1 else 1
+    if steps // block * block > warmup or getattr(hyper, "warmup_updates", False):
         return None
     less = max(steps // 10, 1)
+    blocks = f", but for less than a block of {block:,}" if steps > warmup else ""
     return (
-        f"warmup: all {steps:,} steps are within the warm-up of {warmup:,} random ones, so nothing "
-        f"is learned; give more --steps, or less warm-up, such as --warmup {less}"
+        f"warmup: all {steps:,} steps are within the warm-up of {warmup:,} random ones{blocks}, so "
+        f"nothing is learned; give more --steps, or less warm-up, such as --warmup {less}"
     )
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from pacesetter.cli.flags import Parser, parser
 from pacesetter.cli.policies import add_run, add_seed, parse
 from pacesetter.cli.streams import aside
+from pacesetter.errors import UsageError
 from pacesetter.storage import as_json
 
 if TYPE_CHECKING:
@@ -16,13 +17,21 @@ def evaluate(words: list[str]) -> int:
     from pacesetter import evaluation
 
     given, found = parse(_parser(), words)
+    if given.random and given.noise:
+        raise UsageError("noise: uniformly random actions have none; leave out --noise or --random")
     policy, path, env_kwargs = found.policy, found.file, found.env_kwargs
     task = found.env or policy.about.get("env")
     how: dict[str, Any] = {"noise": given.noise, "random": given.random, **found.task}
     with aside():
         result = evaluation.evaluate(policy, episodes=given.episodes, seed=given.seed, **how)
     if given.json:
-        about = {"env": task, "env_kwargs": env_kwargs, "seed": given.seed, "noise": given.noise}
+        about = {
+            "env": task,
+            "env_kwargs": env_kwargs,
+            "wrap": list(found.wrap or ()),
+            "seed": given.seed,
+            "noise": given.noise,
+        }
         source = None if given.random else str(path)
         print(as_json({**result.table(), **about, "policy": source}))
     else:

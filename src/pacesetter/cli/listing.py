@@ -131,11 +131,12 @@ def _everything(lists: dict[str, Callable[[], list[Row]]]) -> str:
     """The names of every kind, a paragraph each."""
     paragraphs = [
         fill(
-            ", ".join(row["name"] for row in make()) or "none yet",
+            ", ".join(printable(row["name"]) for row in make()) or "none yet",
             WIDTH,
             initial_indent=f"{kind:12}",
             subsequent_indent=" " * 12,
             break_on_hyphens=False,
+            break_long_words=False,
         )
         for kind, make in lists.items()
     ]

@@ -44,15 +44,11 @@ def push(words: list[str]) -> int:
     add("--episodes", type=int, default=10, metavar="N", help=episodes)
     add_seed(command)
     given, found = parse(command, words)
-    if found.env_kwargs != found.policy.about.get("env_kwargs", {}):
-        raise UsageError("env: the card tells of the task that the policy was trained on")
-    if list(found.wrap or ()) != list(found.policy.about.get("wrap", [])):
-        raise UsageError("wrap: the card tells of the task that the policy was trained on")
     from pacesetter.media.hub import push
 
     how = {"video": given.video, "private": given.private, "episodes": given.episodes}
     with aside():
-        page = push(found.file, given.repo, **how, seed=given.seed, env=found.task["env"])
+        page = push(found.file, given.repo, **how, seed=given.seed, **found.task)
     print(page)
     return 0
 

@@ -115,7 +115,7 @@ def _resumed_trainer(words: list[str]) -> Command:
     names = (*budgets, "env_timeout", "checkpoint_every", "allow")
     given = {name: getattr(found, name) for name in names}
     with aside():
-        trainer = Trainer.resume(directory.path, **given)
+        trainer = Trainer.resume(directory.path, runs=found.runs, **given)
     return Command(trainer, found.quiet, log)
 
 

@@ -5,6 +5,7 @@ members that have updates due make them on their own minibatches        learn
 when the round is over, all start again from what the rule chose        end_round
 """
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -76,9 +77,10 @@ class Members:
 
     def close(self) -> None:
         """Let go of envs, files and threads."""
-        self.learners.workers.shutdown()
-        for each in (*(e.env for e in self.explorers), self.selector, self.experience):
-            each.close()
+        with ExitStack() as stack:
+            for each in (self.experience, self.selector, *(e.env for e in self.explorers)):
+                stack.callback(each.close)
+            self.learners.workers.shutdown()
 
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""

@@ -53,6 +53,11 @@ def _check_bases(run: Ensemble, hyper: Any) -> None:
     """Refuse settings whose own value has no factors, and gamma where rows hold sums of rewards."""
     if "exploration_noise" in run.vary and hyper.exploration_noise == 0:
         raise UsageError("vary: exploration_noise itself is 0; must be above 0 to vary")
+    if "exploration_noise" in run.vary and getattr(hyper, "exploration", None) == "parameter":
+        raise UsageError(
+            "vary: exploration_noise cannot differ with --exploration parameter, which adapts and "
+            "copies the noise with the networks"
+        )
     if "gamma" in run.vary and not 0 < hyper.gamma < 1:
         raise UsageError(f"vary: gamma itself is {hyper.gamma}; must lie between 0 and 1 to vary")
     if "gamma" in run.vary and getattr(hyper, "bins", 0):

@@ -66,7 +66,7 @@ class Environment:
         """Start an episode by its number, by default the next one."""
         episode = self.episode + 1 if episode is None else episode
         if self.ranges or (self.recipe.renew and not self.new):
-            self._renew(episode)
+            self.renew(episode)
         self.new = False
         seed = episode_seed(self.seed, self.stream, self.index, episode)
         result: Any = self._call("reset", self.env.reset, seed=seed)
@@ -131,7 +131,7 @@ class Environment:
     def close(self) -> None:
         self._call("close", self.env.close)
 
-    def _renew(self, episode: int) -> None:
+    def renew(self, episode: int) -> None:
         """Make the task anew, with an episode's own keywords if they are drawn."""
         drawn = draw_task(self.seed, self.stream, self.index, episode, self.ranges)
         recipe = replace(self.recipe, kwargs=self.recipe.kwargs | drawn)

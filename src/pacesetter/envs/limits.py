@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from functools import cache
 from math import inf
 from time import monotonic, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 GRACE = 5.0  # seconds in which a call that was woken has to come back
 AGAIN = 1.0  # seconds until a call that caught its waking is woken again
@@ -19,6 +19,13 @@ class Overdue(BaseException):
     """Raised in the task's code, where `except Exception` does not catch it."""
 
 
+class Call(NamedTuple):
+    """When a call must have come back, and what to say if it cannot be woken."""
+
+    due: float
+    message: str
+
+
 class Watchdog(threading.Thread):
     """Ends the process, with one line, if a call stays in C, where no signal handler runs.
 
@@ -27,42 +34,54 @@ class Watchdog(threading.Thread):
 
     def __init__(self) -> None:
         super().__init__(daemon=True, name="watchdog of the task")
-        self.due, self.message = inf, ""
+        self.calls: dict[threading.Thread, Call] = {}  # the innermost one of each thread
 
     def run(self) -> None:
         while True:
-            if monotonic() > self.due:
-                os.write(2, f"pacesetter: stopped: {self.message}\n".encode())
-                _exit(1)
+            for call in [*self.calls.values()]:
+                if monotonic() > call.due + GRACE:
+                    os.write(2, f"pacesetter: stopped: {call.message}\n".encode())
+                    _exit(1)
             sleep(GRACE / 10)
 
 
 @cache
 def _watchdog() -> Watchdog:
-    def wake(number: int, frame: Any) -> None:
-        if _watchdog().due < inf:  # else the call came back at the last moment
-            raise Overdue
-
     found = Watchdog()
     found.start()
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGALRM, wake)
     return found
+
+
+def _wake(number: int, frame: Any) -> None:
+    if threading.main_thread() in _watchdog().calls:  # else it came back at the last moment
+        raise Overdue
 
 
 @contextmanager
 def limited(seconds: float, what: str) -> Generator[None]:
     """Raise Overdue in a call of the main thread that takes longer; end the process if that does
-    not wake it, or if the call is of another thread.
+    not wake it, or if the call is of another thread. Within another such call, the earlier end
+    counts.
     """
-    dog, wakes = _watchdog(), threading.current_thread() is threading.main_thread()
-    dog.message = f"{what}: it has not returned after {seconds:g} s and cannot be woken"
-    dog.due = monotonic() + seconds + GRACE
+    calls, own = _watchdog().calls, threading.current_thread()
+    wakes, around = own is threading.main_thread(), calls.get(own)
+    message = f"{what}: it has not returned after {seconds:g} s and cannot be woken"
+    call = Call(monotonic() + seconds, message)
+    calls[own] = call if around is None or call.due < around.due else around
     if wakes:
-        signal.setitimer(signal.ITIMER_REAL, seconds, AGAIN)
+        signal.signal(signal.SIGALRM, _wake)
+        _wake_at(calls[own].due)
     try:
         yield
     finally:
-        dog.due = inf
+        if around is None:
+            del calls[own]
+        else:
+            calls[own] = around
         if wakes:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            _wake_at(inf if around is None else around.due)
+
+
+def _wake_at(due: float) -> None:
+    left = 0.0 if due == inf else max(due - monotonic(), 1e-6)
+    signal.setitimer(signal.ITIMER_REAL, left, AGAIN if left else 0)

@@ -39,8 +39,7 @@ def prepare(device: str) -> list[str]:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     _refuse_no_device()
-    if device != "auto":
-        jax.config.update("jax_default_device", _device(device))
+    jax.config.update("jax_default_device", None if device == "auto" else _device(device))
     return notes
 
 
@@ -50,7 +49,7 @@ def made_with(products: str) -> dict[str, Any]:
     """
     numerics = {name: jax.config.values[name] for name in NUMERICS}
     numerics |= {name: os.environ[name] for name in OUTSIDE if name in os.environ}
-    return {"backend": jax.default_backend(), "products": products, "numerics": numerics}
+    return {"backend": platform(), "products": products, "numerics": numerics}
 
 
 def platform() -> str:

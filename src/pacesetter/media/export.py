@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter.envs import Recipe
-from pacesetter.errors import UsageError, unknown
+from pacesetter.errors import unknown
 from pacesetter.media.minari import to_minari
 from pacesetter.media.onnx import to_onnx
 from pacesetter.media.sb3 import to_sb3
@@ -50,13 +50,6 @@ def export(
                 f"minari.load_dataset('{path.name}')"
             )
         case "sb3":
-            if isinstance(env, Recipe):
-                if env.wrap:
-                    raise UsageError(
-                        f"wrap: the script makes the plain task, without {', '.join(env.wrap)}; "
-                        "in Python, SB3Policy(policy) of pacesetter.media.sb3 works with any task"
-                    )
-                env, env_kwargs = env.name, env.kwargs
             file = to_sb3(policy, path, env=env, env_kwargs=env_kwargs)
             return f"{path}: its `model` has SB3's predict(); it reads {file.name} beside it"
         case _:

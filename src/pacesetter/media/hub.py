@@ -3,10 +3,11 @@
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
-from pacesetter.evaluation import Evaluation, evaluate
+from pacesetter.evaluation import Evaluation, evaluate, recipe_of
 from pacesetter.files import present
 from pacesetter.media.extras import need
 from pacesetter.policy import Policy, load
@@ -32,6 +33,7 @@ def push(
     episodes: int = 10,
     seed: int = 0,
     env: str | Recipe | None = None,
+    env_kwargs: dict[str, Any] | None = None,
 ) -> str:
     """Send a policy file and a model card, in one commit, to `repo_id` (USER/NAME); its address.
 
@@ -41,9 +43,11 @@ def push(
     """
     hub, path = need("hub", "huggingface_hub", INSTALL), Path(policy_file)
     policy = load(path)
+    task = recipe_of(policy.about, env, env_kwargs)
+    _refuse_another(task, policy.about)
     if video is not None and Path(video).suffix != ".mp4":
         raise UsageError(f"video: {video} must end in .mp4")
-    fresh = evaluate(policy, env, episodes, seed)
+    fresh = evaluate(policy, task, episodes, seed)
     text = card(policy, repo_id, fresh, seed, command or _command(path))
     files = {FILE: path, CARD: text.encode()} | ({VIDEO: Path(video)} if video else {})
     about = policy.about
@@ -64,6 +68,15 @@ def load_from_hub(repo_id: str, filename: str = FILE, *, revision: str | None = 
     with _one_line(repo_id):
         path = hub.hf_hub_download(repo_id, filename, revision=revision, library_name="pacesetter")
     return load(path)
+
+
+def _refuse_another(task: Recipe, about: dict[str, Any]) -> None:
+    """Refuse a return on another task than the one that the card names."""
+    own = about.get("env"), about.get("env_kwargs", {}), tuple(about.get("wrap", ()))
+    names = ("env", "env", "wrap")
+    for name, given, trained in zip(names, (task.name, task.kwargs, task.wrap), own, strict=True):
+        if given != trained:
+            raise UsageError(f"{name}: the card tells of the task that the policy was trained on")
 
 
 @contextmanager

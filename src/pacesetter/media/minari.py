@@ -52,7 +52,9 @@ def to_minari(
             minari.create_dataset_from_buffers(
                 path.name,
                 [kind(**buffer) for buffer in buffers],
-                env=world.env,
+                env=world.env if _as_json(world) else None,
+                action_space=world.env.action_space,
+                observation_space=world.env.observation_space,
                 algorithm_name=policy.about.get("algorithm"),
                 description=_describe(policy, world.name, returns, seed),
             )
@@ -84,6 +86,14 @@ def _episode(policy: Policy, world: Environment, number: int) -> dict[str, Any]:
         found["terminations"].append(step.terminated)
         found["truncations"].append(step.truncated)
     return found
+
+
+def _as_json(world: Environment) -> bool:
+    """Whether a data set can say how its env is made; not of one registered by a class itself."""
+    try:
+        return world.env.spec is not None and bool(world.env.spec.to_json())
+    except (TypeError, ValueError):
+        return False
 
 
 def _check(path: Path, episodes: int) -> None:

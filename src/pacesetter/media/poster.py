@@ -43,7 +43,7 @@ def poster(
     with scene(policy, env, env_kwargs, seed, size, camera) as world:
         states = _walk(policy, world)
         steps = _cycle(states, frames) if cycle else _evenly(0, len(states) - 1, frames)
-        pictures = _pictures(policy, world, steps)
+        pictures = _pictures(policy, world, states, steps)
     _save(path, pictures, steps)
     return steps
 
@@ -86,10 +86,17 @@ def period(states: NDArray[np.float64]) -> int | None:
     return None
 
 
-def _pictures(policy: Policy, world: Environment, steps: list[int]) -> list[Frame]:
+def _pictures(
+    policy: Policy, world: Environment, states: NDArray[np.float64], steps: list[int]
+) -> list[Frame]:
     """Go through the same episode once more, since only now it is known what to draw."""
     observation, pictures = world.reset(0), list[Frame]()
     for step in range(steps[-1] + 1):
+        if not np.array_equal(observation, states[step]):
+            raise UsageError(
+                f"env: {world.name} does not repeat an episode from its seed, so no poster of it; "
+                "make a film with `pacesetter record`"
+            )
         if step in steps:
             pictures.append(draw(world))
         if step < steps[-1]:

@@ -95,28 +95,37 @@ def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
     import imageio.v2
 
     library: Any = imageio.v2
-    first = next(film)  # so that no file is made where nothing can be drawn
-    written = 0
+    ahead = [*islice(film, 2)]  # so that no file is made where nothing can be drawn
+    durations: list[int] = []  # of frames; a GIF's are read when it is closed
+    told = durations if len(ahead) > 1 else duration(0, rate)  # as Pillow wants it
     try:
         # Otherwise ffmpeg is started by a plain fork, which JAX's threads make unsafe.
         with (
             replacing(path) as file,
             setting("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1"),
-            library.get_writer(file, **_options(path.suffix, rate)) as writer,
+            library.get_writer(file, **_options(path.suffix, rate, told)) as writer,
         ):
-            for frame in chain([first], film):
+            for number, frame in enumerate(chain(ahead, film)):
                 writer.append_data(frame)
-                written += 1
+                durations.append(duration(number, rate))
     except OSError as error:
         reason = error.strerror or str(error).splitlines()[0]
         raise UsageError(f"video: cannot write {path}: {reason}") from None
-    return written
+    return len(durations)
 
 
-def _options(suffix: str, rate: float) -> dict[str, Any]:
+def duration(number: int, rate: float) -> int:
+    """Milliseconds of a frame, in whole hundredths of a second, which is all a GIF knows.
+
+    They add up to the film's own time. None is below two, as viewers play those at ten.
+    """
+    begin, end = (round(100 * frame / rate) for frame in (number, number + 1))
+    return 10 * max(2, end - begin)
+
+
+def _options(suffix: str, rate: float, durations: list[int] | int) -> dict[str, Any]:
     if suffix == ".gif":
-        # Hundredths of a second are all a GIF knows, and below two of them viewers play it at ten.
-        return {"mode": "I", "duration": max(20, round(100 / rate) * 10), "loop": 0}
+        return {"mode": "I", "duration": durations, "loop": 0}
     return {
         "format": "FFMPEG",
         "fps": rate,

@@ -4,7 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.consent import require
+from pacesetter.envs import Recipe
+from pacesetter.envs.tasks import FUNCTION
 from pacesetter.errors import UsageError
+from pacesetter.evaluation import recipe_of
 from pacesetter.files import write_atomically
 from pacesetter.policy import Floats, Policy
 
@@ -18,11 +21,11 @@ from pacesetter.media.sb3 import SB3Policy
 model = SB3Policy(load(Path(__file__).with_suffix(".safetensors")))
 
 if __name__ == "__main__":
-    import gymnasium
+    from pacesetter.envs import Recipe
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.monitor import Monitor
 
-    env = Monitor(gymnasium.make({task}))
+    env = Monitor(Recipe({task}).make())
     mean, std = evaluate_policy(model, env, n_eval_episodes=10)
     print(f"return {{mean:.1f}} +- {{std:.1f}} over 10 episodes")
 '''
@@ -55,7 +58,7 @@ def to_sb3(
     policy: Policy,
     path: Path,
     *,
-    env: str | None = None,
+    env: str | Recipe | None = None,
     env_kwargs: dict[str, Any] | None = None,
 ) -> Path:
     """Write a short script that makes the `model`, and beside it the policy file, which it names.
@@ -64,16 +67,20 @@ def to_sb3(
     """
     if path.suffix != ".py":
         raise UsageError(f"sb3: {path} must end in .py")
-    name = env or policy.about.get("env")
-    if name is None:
-        raise UsageError("env: none given and the policy names none")
-    require("env", name, [env], loaded=())  # the script will run in another process
+    task = recipe_of(policy.about, env, env_kwargs)
+    if not isinstance(env, Recipe):
+        for kind, names in (("env", (task.name,)), ("wrap", task.wrap)):
+            for name in names:
+                require(kind, name, [env], loaded=())  # the script will run in another process
+    if task.name.startswith(FUNCTION):
+        raise UsageError(f"env: '{task.name}' was given as a function, which no script can name")
     file = path.with_suffix(".safetensors")
     if file.exists():
         raise UsageError(f"sb3: {file} exists; give {path.name} another name")
-    own = policy.about.get("env_kwargs", {}) if name == policy.about.get("env") else {}
-    kwargs = own if env_kwargs is None else env_kwargs
-    text = SCRIPT.format(task=f"{name!r}, **{kwargs!r}" if kwargs else repr(name))
+    given = [task.name, task.kwargs, task.wrap]
+    while not given[-1]:
+        given.pop()
+    text = SCRIPT.format(task=", ".join(map(repr, given)))
     try:
         policy.save(file)
         write_atomically(path, text.encode())

@@ -3,7 +3,8 @@
 import importlib
 import os
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,44 @@ from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError, unknown
 from pacesetter.evaluation import enter
 from pacesetter.policy import Policy
+from pacesetter.seeding import Stream
 
 Frame = NDArray[np.uint8]
 INSTALL = "apt-get install -y --no-install-recommends libegl1 libgl1"
 SHADOW = 1024  # pixels of a side of the shadow map
 HAZE = 0.36, 0.40, 0.37  # of a far checkered floor; white would draw a line at the horizon
 FOLLOW, FREE = "track", "free"  # the name of MuJoCo's own models; what Gymnasium would show
+
+
+class Stage(Environment):
+    """A task that is drawn with a size and a camera of MuJoCo's, also when it is made anew."""
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        seed: int,
+        stream: Stream,
+        *,
+        size: tuple[int, int],
+        camera: str | None,
+    ) -> None:
+        super().__init__(recipe, seed, stream)
+        self.size, self.camera = size, camera
+
+    def renew(self, episode: int) -> None:
+        super().renew(episode)
+        aim(self, self.size, self.camera)
+
+    def close(self) -> None:
+        """Close the env; MuJoCo's picture buffers first.
+
+        Garbage collection would free them by number in whatever film is drawn then, and blacken it.
+        """
+        task: Any = self.env.unwrapped
+        if is_mujoco(self) and (viewer := task.mujoco_renderer.viewer) is not None:
+            viewer.make_context_current()
+            viewer.con.free()
+        super().close()
 
 
 @contextmanager
@@ -30,15 +63,12 @@ def scene(
     seed: int,
     size: tuple[int, int],
     camera: str | None,
-) -> Generator[Environment]:
+) -> Generator[Stage]:
     """The task in the mode rgb_array; without EGL or with an unknown camera, a UsageError."""
-    with gl():
-        world = enter(policy, env, seed, env_kwargs, render_mode="rgb_array")
-        try:
-            aim(world, size, camera)
-            yield world
-        finally:
-            leave(world)
+    stage = partial(Stage, size=size, camera=camera)
+    with gl(), closing(enter(policy, env, seed, env_kwargs, stage, render_mode="rgb_array")) as one:
+        aim(one, size, camera)
+        yield one
 
 
 def check_size(size: tuple[int, int]) -> None:
@@ -154,18 +184,6 @@ def lay_floor(model: Any) -> None:
             if not model.mat_texuniform[material]:
                 # Squares are counted over half the floor, and where that has no end, over a metre.
                 model.mat_texrepeat[material] /= size
-
-
-def leave(world: Environment) -> None:
-    """Close the env; MuJoCo's picture buffers first.
-
-    Garbage collection would free them by number in whatever film is drawn then, and blacken it.
-    """
-    task: Any = world.env.unwrapped
-    if is_mujoco(world) and (viewer := task.mujoco_renderer.viewer) is not None:
-        viewer.make_context_current()
-        viewer.con.free()
-    world.close()
 
 
 def _try_gl() -> None:

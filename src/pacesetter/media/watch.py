@@ -1,16 +1,21 @@
 """A policy at its task, live: in a window, or on a page for the browser of this machine."""
 
 import os
+import signal
+from contextlib import closing
+from dataclasses import replace
 from importlib.util import find_spec
 from itertools import count
+from time import perf_counter, sleep
 from typing import Any
 
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
-from pacesetter.evaluation import enter
+from pacesetter.evaluation import enter, recipe_of
 from pacesetter.media.extras import need
 from pacesetter.media.scene import FOLLOW, camera_number, is_mujoco, lay_floor
 from pacesetter.policy import Policy
+from pacesetter.types import Floats
 
 INSTALL = "mjviser"  # no extra of ours: viser 1.1 wants an older rich than our progress bars
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -37,16 +42,17 @@ def watch(
     if episodes is not None and episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
     page = _wants_page(browser)
-    world = enter(policy, env, seed, env_kwargs, **({} if page else {"render_mode": "human"}))
+    task = recipe_of(policy.about, env, env_kwargs)
     try:
-        if page:
-            _page(policy, world, port)
+        if page:  # which goes on showing the model that it began with
+            with closing(enter(policy, replace(task, renew=False), seed)) as world:
+                _page(policy, world, port)
         else:
-            _window(policy, world, episodes)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        world.close()
+            with closing(enter(policy, task, seed, None, Window, render_mode="human")) as world:
+                _window(policy, world, episodes)
+    except KeyboardInterrupt as end:  # Ctrl-C is how it is meant to end; other signals are not
+        if end.args not in ((), (signal.SIGINT,)):
+            raise
 
 
 def _wants_page(browser: bool | None) -> bool:
@@ -62,15 +68,27 @@ def _wants_page(browser: bool | None) -> bool:
     return True
 
 
+class Window(Environment):
+    """A task in a window whose camera follows the walker, also when it is made anew."""
+
+    def reset(self, episode: int | None = None) -> Floats:
+        before = None if self.new else self.env
+        observation = super().reset(episode)
+        if is_mujoco(self) and self.env is not before:
+            _follow(self)
+        return observation
+
+
 def _window(policy: Policy, world: Environment, episodes: int | None) -> None:
-    """Gymnasium draws at each step and waits for the clock."""
-    if is_mujoco(world):
-        _follow(world)
+    """Gymnasium draws at each step; MuJoCo's windows do not wait for the clock, so this does."""
+    pace = float(world.env.metadata.get("render_fps") or 0) if is_mujoco(world) else 0.0
     for _ in count() if episodes is None else range(episodes):
-        observation, ended = world.reset(), False
+        observation, ended, began = world.reset(), False, perf_counter()
         while not ended:
             step = world.step(policy.act(observation))
             observation, ended = step.observation, step.ended
+            if pace:
+                sleep(max(0.0, began + len(world.actions) / pace - perf_counter()))
 
 
 def _follow(world: Environment) -> None:

@@ -52,6 +52,7 @@ class ByError(Sampler):
     ) -> SampledIndices:
         self._admit(window)
         strata = (np.arange(shape[-1]) + rng.random(shape)) / shape[-1]
+        strata = rng.permuted(strata, axis=-1)  # rows in any order, as STEVE deals them by place
         places = self.tree.find(strata)
         newest = window.stop - 1
         numbers = newest - (newest - places) % self.tree.size

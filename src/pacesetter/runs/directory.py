@@ -65,6 +65,11 @@ class RunDirectory:
         found += [self.state_file, self.previous_file, *last.glob("replay-*.bin")]
         return [file for file in found if present(file)]
 
+    @property
+    def checkpoints(self) -> list[Path]:
+        """The newest first, whether they are there or not."""
+        return [self.state_file, self.previous_file]
+
     def refuse_existing(self, config: Config) -> None:
         """Refuse to train where a run is already, and say what to do instead."""
         if not present(self.config_file):

@@ -1,5 +1,6 @@
 """What a result needs to be repeated: command, versions, commit, machine, threads, libraries."""
 
+import os
 import platform
 import shlex
 import shutil
@@ -12,6 +13,7 @@ from typing import Any
 
 from pacesetter.process import cores, threads
 
+NUMBERS = {"family": "cpu family", "model": "model"}  # of a processor in /proc/cpuinfo
 PACKAGES = ("pacesetter", "jax", "jaxlib", "optax", "numpy", "gymnasium", "mujoco", "safetensors")
 
 
@@ -22,7 +24,7 @@ def provenance(**found: Any) -> dict[str, Any]:
         "versions": versions(),
         "commit": _commit(),
         "threads": threads(),
-        "machine": f"{platform.machine()}, {len(cores())} cores",
+        "machine": f"{_processor()}, {len(cores())} of {os.cpu_count()} cores",
         **found,
     }
 
@@ -31,6 +33,19 @@ def provenance(**found: Any) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide results."""
     return {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+@cache
+def _processor() -> str:
+    """Kind of processor, and on Linux its model, of which names alone often say little."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    found = {name.strip(): value.strip() for name, _, value in (x.partition(":") for x in lines)}
+    words = [found.get("model name", "")]
+    words += [f"{name} {found[key]}" for name, key in NUMBERS.items() if key in found]
+    return ", ".join([platform.machine(), *filter(None, words)])
 
 
 def _program() -> str:

@@ -28,20 +28,31 @@ class _Settings(BaseModel):
     eval_episodes: Positive = 1
     env_kwargs: dict[str, Any] = {}
     wrap: list[str] = []
+    stop_at: Finite | None = None
+    stop_patience: Positive | None = None
 
 
-class Record(BaseModel):
-    """config.json, and the first part of a line of results."""
+class _Made(BaseModel):
+    """What made a run, or went on with it."""
 
-    schema_: Literal[1] = Field(alias="schema")
-    settings: _Settings
-    threads: Positive
     command: str = ""
     machine: str = ""
     commit: str | None = None
     versions: dict[str, str] = {}
     products: str | None = None
-    resumed: list[dict[str, Any]] = []
+
+
+class _Resumed(_Made):
+    threads: Positive | None = None
+
+
+class Record(_Made):
+    """config.json, and the first part of a line of results."""
+
+    schema_: Literal[1] = Field(alias="schema")
+    settings: _Settings
+    threads: Positive
+    resumed: list[_Resumed] = []
 
 
 class _Row(BaseModel):

@@ -252,7 +252,7 @@ class RunSettings(TypedDict, total=False):
     renew_every: int
     """iterations from new networks to new; 0: never"""
     imagined_steps: int | str
-    """imagined steps of a policy update"""
+    """imagined steps of a policy update, in whole episodes at most"""
     bootstrap: bool
     """the critic's value counts at the horizon"""
     policy_updates: int

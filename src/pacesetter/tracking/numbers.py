@@ -1,6 +1,7 @@
 """A row of the log as named numbers, which is all that a tracker can plot."""
 
 from collections.abc import Iterable, Iterator
+from math import isfinite
 from typing import Any
 
 from pacesetter.runs import Row
@@ -36,7 +37,10 @@ def _named(name: str, value: Any, columns: tuple[str, ...]) -> Iterator[tuple[st
 
 
 def _mean(name: str, values: Iterable[Any]) -> Iterator[tuple[str, float]]:
-    """The mean of what is a number; NaN is null in the log, and a tracker gets no point of it."""
+    """The mean of what is a number; NaN and infinity are null in the log, and no tracker gets a
+    point of them.
+    """
     found = [float(value) for value in values if isinstance(value, (int, float))]
+    found = [value for value in found if isfinite(value)]
     if found:
         yield name, sum(found) / len(found)

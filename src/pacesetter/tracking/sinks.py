@@ -69,7 +69,8 @@ def tensorboard(run: Tracked) -> Generator[Write]:
 def wandb(run: Tracked) -> Generator[Write]:
     """A W&B run in the run's folder, offline unless WANDB_MODE says otherwise.
 
-    A resumed run keeps its id. The server leaves out steps that it has.
+    A resumed run keeps its id. The server leaves out steps that it has, so all rows of a step go
+    together, once a later one comes or the step has its evaluation.
     """
     mode = os.environ.get("WANDB_MODE", "offline")
     if mode == "offline":
@@ -88,13 +89,24 @@ def wandb(run: Tracked) -> Generator[Write]:
         settings=tool.Settings(silent=True, console="off"),
     )
 
+    held: list[Row] = []
+
+    def send() -> None:
+        for row in held:
+            opened.log(numbers(row), step=row["step"])
+        held.clear()
+
     def write(row: Row) -> None:
-        opened.log(numbers(row), step=row["step"])
+        if held and row["step"] != held[0]["step"]:
+            send()
+        held.append(row)
 
     try:
-        for row in run.rows if run.is_new else ():
+        for row in run.rows:
             write(row)
         yield write
+        if any(row["kind"] == "eval" for row in held):  # a stopped run may evaluate there later
+            send()
     finally:
         opened.finish()
 

@@ -67,8 +67,7 @@ def save(loop: Loop, config: Config, directory: RunDirectory) -> None:
 def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
     """Take up the newest checkpoint that is whole; what a person should know about it, in lines."""
     notes: list[str] = []
-    checkpoints = [directory.state_file, directory.previous_file]
-    for file in filter(files.present, checkpoints):
+    for file in filter(files.present, directory.checkpoints):
         try:
             _restore(loop, config, directory, file, notes)
         except Refused:

@@ -113,9 +113,14 @@ class Evaluator:
 
 
 def _keep(policy: Policy, folder: Path, step: int, most: int) -> None:
-    """Write the policy of a step, and remove the oldest beyond so many."""
+    """Write the policy of a step, and remove the oldest beyond so many.
+
+    Those of later steps too: of evaluations that a killed run made after its last checkpoint.
+    """
     make_folder(folder)
     policy.save(folder / f"step-{step}.safetensors")
-    kept = {int(file.stem[5:]): file for file in folder.glob("step-[0-9]*.safetensors")}
-    for old in sorted(kept)[:-most]:
-        kept[old].unlink()
+    found = [file for file in folder.glob("step-*.safetensors") if file.stem[5:].isdecimal()]
+    kept = {int(file.stem[5:]): file for file in found}
+    later = [number for number in kept if number > step]
+    for number in (*later, *sorted(kept.keys() - {*later})[:-most]):
+        kept[number].unlink()

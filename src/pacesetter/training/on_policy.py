@@ -6,6 +6,7 @@ one update from the whole rollout, then its observations join them      learn
 A checkpoint falls between iterations, so it holds no rollout: only running episodes.
 """
 
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,10 +78,10 @@ class OnPolicyLoop:
 
     def close(self) -> None:
         """Let go of envs, files and threads."""
-        self.learners.workers.shutdown()
-        for explorer in self.explorers:
-            explorer.env.close()
-        self.source.close()
+        with ExitStack() as stack:
+            for each in (self.source, *(e.env for e in self.explorers)):
+                stack.callback(each.close)
+            self.learners.workers.shutdown()
 
     def training_values(self) -> dict[str, Any]:
         """How training went since this was last called."""

@@ -24,7 +24,7 @@ def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
     source = str(config.run.start_from)
     try:
         if Path(source).suffix == ".safetensors":
-            _from_policy(loop, Path(source))
+            _from_policy(loop, config, Path(source))
         else:
             _from_run(loop, config, source, runs)
     except storage.FAULTS as error:
@@ -43,7 +43,8 @@ def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None
             )
     champion = int(table["progress"]["champion"])
     found = below(f"states.{champion}", arrays)
-    loop.learners.replace([_copied(state, found) for state in loop.learners.states])
+    learner, states = loop.learners.compiled.learner, loop.learners.states
+    loop.learners.replace([learner.restarted(_copied(state, found)) for state in states])
     parts = loop.parts()
     parts["normalizer"].restore({}, below("normalizer", arrays))
     if "returns" in parts:  # the critics' values are in units of its deviation
@@ -51,7 +52,7 @@ def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None
         parts["returns"].restore({}, fresh | {"sums": below("returns", arrays)["sums"]})
 
 
-def _from_policy(loop: Loop, file: Path) -> None:
+def _from_policy(loop: Loop, config: Config, file: Path) -> None:
     found = policy.load(file)
     if len(found.actors) > 1:
         raise UsageError(f"start_from: {file} averages {len(found.actors)} actors; name its run")
@@ -59,6 +60,11 @@ def _from_policy(loop: Loop, file: Path) -> None:
         raise UsageError(
             f"start_from: {file} acts on normalized observations, whose statistics a run keeps; "
             "name its run"
+        )
+    if config.hyper.normalize_observation:
+        raise UsageError(
+            f"start_from: {file} acts on the task's own observations; give "
+            "--no-normalize-observation, or name a run that has it"
         )
     learner, states = loop.learners.compiled.learner, loop.learners.states
     own = learner.policy(states[0])

@@ -1,7 +1,8 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
+import sys
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
@@ -13,7 +14,8 @@ from pacesetter.ensemble.progress import Progress
 from pacesetter.envs import apart
 from pacesetter.envs.apart import Apart
 from pacesetter.envs.tasks import Factory, name_of
-from pacesetter.errors import TaskError, TrainingError, UsageError
+from pacesetter.errors import TaskError, TrainingError, UsageError, reason
+from pacesetter.files import present
 from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
@@ -119,7 +121,10 @@ class Trainer:
         try:
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
+            begun = any(map(present, self.directory.checkpoints))
             notes = checkpoint.restore(self.loop, self.config, self.directory)
+            if not begun and self.config.run.start_from is not None:
+                start_from(self.loop, self.config, runs)
             self.notes += [*self.directory.notes, *notes]
             if self.progress.step > self.budget:
                 raise UsageError(f"steps: the run has made {self.progress.step:,}; give more")
@@ -154,20 +159,25 @@ class Trainer:
         try:
             while True:
                 self._reporter.tell_time()
-                ending = self._spent
-                yield from self._reporter.due(ending)
-                if self._settled and not ending:
-                    yield from self._reporter.due(ending=True)
-                if ending or self._stopping or self._settled:
-                    break
-                if self._save_is_due():
-                    self.save()
+                if not self.progress.acting or self.progress.step >= self.budget:
+                    # Else a fault of the task broke a tick off, which is to end first.
+                    ending = self._spent
+                    yield from self._reporter.due(ending)
+                    if self._settled and not ending:
+                        yield from self._reporter.due(ending=True)
+                    if ending or self._stopping or self._settled:
+                        break
+                    if self._save_is_due():
+                        self.save()
                 selection = self.loop.tick()
                 if selection is not None:
                     self._reporter.add("select", selection.row())
             self.save()
         except GeneratorExit:
-            self.save()
+            try:
+                self.save()
+            except (OSError, TrainingError) as error:  # Python would pass over what is raised here
+                print(f"pacesetter: not saved: {reason(error)}", file=sys.stderr)
             raise
         except TaskError:
             if self.loop.whole:
@@ -178,7 +188,9 @@ class Trainer:
             where = f"step {self.progress.step}: {self.directory.path}"
             raise TrainingError(f"{where}: {error.strerror or error}") from error
         finally:
-            self.close()
+            failed = sys.exception() is not None  # and is the error to be seen
+            with suppress(TaskError) if failed else nullcontext():
+                self.close()
 
     @property
     def progress(self) -> Progress:
@@ -224,11 +236,9 @@ class Trainer:
         if self._closed:
             return
         self._closed = True
-        try:
-            self.loop.close()
-            self._evaluator.close()
-        finally:
-            self.directory.unlock()
+        with ExitStack() as stack:  # which closes the rest too where one fails
+            for close in (self.directory.unlock, self._evaluator.close, self.loop.close):
+                stack.callback(close)
 
     def _refuse_closed(self) -> None:
         if self._closed:

@@ -18,6 +18,7 @@ FOLDER = Path(__file__).with_name("suites")
 MOST_SEEDS = 1_000  # of one entry, so that a slip of the pen is no list of a million runs
 TUNING_SEEDS = 2**31  # seeds of `tune` start here and seeds of `bench` end here, so none is both
 DECIDED = ("algorithm", "env", "name", "seed")
+OF_ENTRIES = {"algorithm", "envs", "seeds", "config"}  # keys of an entry that are no settings
 
 
 class Suite(NamedTuple):
@@ -63,6 +64,8 @@ def load(name: str) -> Suite:
     about, entries = table.pop("help", ""), table.pop("entries", None)
     if not isinstance(entries, dict) or not entries:
         raise UsageError(f"suite: {path} has no [entries.NAME]")
+    if "algorithm" in table:
+        raise UsageError(f"suite: {path}: algorithm belongs into an entry: [entries.NAME]")
     for name, entry in entries.items():
         if not isinstance(entry, dict):
             raise UsageError(f"suite: {path}: entries.{name} must be a table")
@@ -132,6 +135,8 @@ def _for_env(entry: Settings, env: str) -> Settings:
         raise UsageError('env: must be tables of settings by task, such as env."HalfCheetah-*"')
     found = {key: value for key, value in entry.items() if key != "env"}
     for pattern, table in by_env.items():
+        if own := sorted(OF_ENTRIES & table.keys()):
+            raise UsageError(f'{own[0]}: is of the whole entry; it cannot stand in env."{pattern}"')
         if fnmatchcase(env, pattern):
             found |= _with_underscores(table)
     return found
@@ -140,8 +145,8 @@ def _for_env(entry: Settings, env: str) -> Settings:
 def _jobs(
     name: str, env: str, seeds: list[int], given: Settings, runs: str | Path
 ) -> Iterable[Job]:
-    own = {key: value for key, value in given.items() if key not in ("envs", "seeds", "config")}
-    algorithm = own.pop("algorithm", name)
+    own = {key: value for key, value in given.items() if key not in OF_ENTRIES}
+    algorithm = given.get("algorithm", name)
     for key in DECIDED:
         if key in own:
             raise UsageError(f"{key}: cannot be set here; the entry's name, envs and seeds set it")
@@ -159,7 +164,7 @@ def _flags(settings: Settings) -> Iterable[str]:
     for key, value in settings.items():
         flag = key.replace("_", "-")
         if key == "env_kwargs":
-            yield from (f"--env.{name}={json.dumps(each)}" for name, each in value.items())
+            yield from (f"--env.{name}={_keyword(each)}" for name, each in value.items())
         elif isinstance(value, dict):
             yield from (f"--{flag}={n}={','.join(map(str, each))}" for n, each in value.items())
         elif isinstance(value, bool):
@@ -170,6 +175,11 @@ def _flags(settings: Settings) -> Iterable[str]:
             raise UsageError(f"{key}: has a value in the preset and cannot be unset")
         else:
             yield f"--{flag}={value}"
+
+
+def _keyword(value: Any) -> str:
+    """A keyword of an env as `--env.KEY` reads it."""
+    return "none" if value is None else json.dumps(value)
 
 
 def _envs(value: Any) -> list[str]:

@@ -1,6 +1,7 @@
 """Gathering runs for a comparison: which may be compared, and what a reader must be told."""
 
-from collections import Counter, defaultdict
+import re
+from collections import defaultdict
 from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
@@ -11,6 +12,7 @@ from pydantic.dataclasses import dataclass as checked
 
 from pacesetter.errors import UsageError, unknown
 from pacesetter.runs import FREE_PER_SEED
+from pacesetter.runs.directory import HORIZONS
 from pacesetter.runs.log import Row
 from pacesetter.settings import STRICT
 from pacesetter.settings.ensemble import WINDOWS
@@ -22,7 +24,13 @@ from pacesetter.study.compare.groups import CONTROL, METRICS, Comparison, Group,
 from pacesetter.study.compare.results import Run
 
 # `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
-_FREE = FREE_PER_SEED - {"replay_horizon", "lr_horizon"}
+_FREE = FREE_PER_SEED - HORIZONS
+MACHINES = {  # what decides CPU seconds
+    "threads": "thread counts",
+    "machine": "machines",
+    "backend": "kinds of device",
+    "products": "libraries of matrix products",
+}
 
 
 @checked(frozen=True, config=STRICT)
@@ -164,12 +172,13 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     if few:
         names = _few([f"{group.env} {group.name} (n={len(group.runs)})" for group in few])
         notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {names}.")
-    short = [run for run in runs if len(run.steps) < stats.FEWEST_EVALUATIONS]
+    counted = [(run, int(run.counted.sum())) for run in runs]
+    short = [(run, many) for run, many in counted if many < stats.FEWEST_EVALUATIONS]
     if short:
-        names = _few([f"{run.env} {run.name} seed {run.seed} ({len(run.steps)})" for run in short])
+        names = _few([f"{run.env} {run.name} seed {run.seed} ({many})" for run, many in short])
         notes.append(
-            f"Fewer than {stats.FEWEST_EVALUATIONS} evaluations, so the last one counts alone: "
-            f"{names}. A smaller --eval-every gives more."
+            f"Fewer than {stats.FEWEST_EVALUATIONS} evaluations after the first update, so the "
+            f"last one counts alone: {names}. A smaller --eval-every gives more."
         )
     if limit.budget or limit.cpu:
         notes.append(f"Every run counts up to {limit}.")
@@ -178,13 +187,37 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     for key, what in (("eval_every", "evaluations come at"), ("eval_episodes", "episodes differ")):
         if len({run.settings.get(key) for run in runs}) > 1:
             notes.append(f"Settings of the evaluation differ ({key}): {what} other numbers.")
-    for key, what in (("threads", "thread counts"), ("machine", "machines")):
-        if len({str(run.table[key]) for run in runs}) > 1:
+    makers = [made for run in runs for made in run.makers]
+    for key, what in MACHINES.items():
+        # What an older version did not record is not a difference.
+        if len({str(made[key]) for made in makers if _is_told(made, key)}) > 1:
             notes.append(f"The runs had several {what}: compare no CPU or wall seconds.")
-    commits = Counter(str(run.table["commit"]) for run in runs)
+    notes += _unfinished_schedules(runs) if limit.budget or limit.cpu else []
+    commits = {str(made["commit"]) for made in makers}
     if len(commits) > 1:
         notes.append(f"The runs come from {len(commits)} commits; the last table lists them.")
     return notes
+
+
+def _is_told(made: Row, key: str) -> bool:
+    """Whether it is on record; older versions named no processor."""
+    value = made.get(key)
+    return value is not None and not (key == "machine" and re.fullmatch(r"\w+, \d+ cores", value))
+
+
+def _unfinished_schedules(runs: list[Run]) -> list[str]:
+    """A note on runs that are cut within a schedule that was meant for a longer run."""
+    within = [
+        f"{run.env} {run.name} seed {run.seed}"
+        for run in runs
+        if any((run.settings.get(key) or 0) > run.settings["steps"] for key in HORIZONS)
+    ]
+    if not within:
+        return []
+    return [
+        "Cut before their schedule (learning rate, importance of the replay) has ended, so a run "
+        f"of this budget would differ: {_few(within)}."
+    ]
 
 
 def _few(words: list[str], most: int = 6) -> str:

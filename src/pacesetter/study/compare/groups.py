@@ -11,7 +11,7 @@ from pacesetter.study.compare.stats import Array
 
 METRICS = {
     "final": "mean of the evaluations in the last 10% of the budget, and of at least three; of one "
-    "or two, the last",
+    "or two, the last; none before the first update counts",
     "auc": "area under the curve of evaluations, divided by the env steps it spans",
     "max": "largest evaluation after the first update; inflated, as a maximum of noisy values is",
 }
@@ -49,8 +49,8 @@ class Group:
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the run that has the fewest."""
-        return min(len(run.steps) for run in self.runs)
+        """Evaluations that count for the final return of the run that has the fewest."""
+        return min(int(run.counted.sum()) for run in self.runs)
 
     def cut(self, budget: int) -> "Group":
         return Group(self.env, self.name, [run.cut(budget) for run in self.runs])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from pacesetter.errors import UsageError
@@ -43,6 +44,7 @@ class _Line(BaseModel):
     selections: list[tuple[Natural, Finite | None, Finite | None, list[Natural], Natural]] = Field(
         []
     )
+    varied: list[dict[str, list[Finite]]] = Field([])
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Run:
     def env(self) -> str:
         """The task: env id with version, and keywords and wrappers if there are any."""
         kwargs, wrap = self.settings.get("env_kwargs") or {}, self.settings.get("wrap") or ()
-        words = [f"{k}={v}" for k, v in kwargs.items()] + [f"wrap={name}" for name in wrap]
+        words = [f"{k}={v}" for k, v in sorted(kwargs.items())]
+        words += [f"wrap={name}" for name in wrap]
         return printable(" ".join([self.settings["env"], *words]))
 
     @property
@@ -121,13 +124,27 @@ class Run:
         return self.cut(int(self.clock[self.cpu <= cpu].max(initial=-1)))
 
     def metric(self, name: str) -> float:
-        """`final`, `auc` or `max`; the last is over evaluations after the first update."""
-        if name == "final":
-            return stats.final(self.clock, self.returns, self.budget)
+        """`final`, `auc` or `max`; the first and last are of evaluations after the first update.
+
+        A run without any has the final return of the policy that it began with.
+        """
         if name == "auc":
             return stats.area(self.steps, self.returns)
+        if name == "final":
+            return stats.final(self.clock[self.counted], self.returns[self.counted], self.budget)
         learned = self.returns[self.updates > 0]
         return float(learned.max()) if learned.size else np.nan
+
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Which evaluations (N,) count for the final return."""
+        learned = self.updates > 0
+        return learned if learned.any() else np.ones_like(learned)
+
+    @property
+    def makers(self) -> list[Row]:
+        """What made the run: where it began, and each session that resumed it."""
+        return [self.table, *(self.table | row for row in self.table.get("resumed", []))]
 
     def reached(self, level: float) -> float:
         """Env steps at which a policy that has learned at all first had a return of `level`."""
@@ -203,8 +220,14 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         if (np.diff(run.steps, prepend=0) < 0).any():
             raise ValueError("evaluations: their steps must never fall")
         members = run.settings.get("members", 1)
-        if any(len(row[3]) != members or max(row[3]) >= members for row in run.selections):
-            raise ValueError(f"selections: parents must be {members} members")
+        rows: list[Any] = table.get("selections", [])
+        if any(len(row[3]) != members or max(*row[3], row[4]) >= members for row in rows):
+            raise ValueError(f"selections: parents and champion must be of {members} members")
+        varied: list[Any] = table.get("varied", [])
+        if varied and len(varied) != len(rows) + 1:
+            raise ValueError("varied: must have a row at the start and one per selection")
+        if any(len(each) != members for row in varied for each in row.values()):
+            raise ValueError(f"varied: must have {members} values of each setting")
     except (ValueError, TypeError, LookupError) as error:
         raise UsageError(f"{source}: damaged or foreign: {error}") from None
     return run

@@ -42,7 +42,7 @@ class Interval(NamedTuple):
 def final(steps: Array, returns: Array, budget: float) -> float:
     """Mean of the evaluations in the last 10% of the budget, and of at least three.
 
-    Of one or two it is the last: the mean would take in the policy before it has learned.
+    Of one or two it is the last: the mean would take in the policy when it had hardly learned.
     """
     if len(returns) < FEWEST_EVALUATIONS:
         return float(returns[-1])

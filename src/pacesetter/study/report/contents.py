@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pacesetter.runs.log import Row
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.groups import METRICS, Comparison, Group, split
 from pacesetter.study.compare.stats import FEWEST_EVALUATIONS, FEWEST_SEEDS, Array, Interval
@@ -126,7 +127,7 @@ def runs(comparison: Comparison) -> Table:
             number(run.budget),
             spread(run.metric("final"), None),
             word(run.table["command"]),
-            word((run.table["commit"] or "none")[:12] + _dirty(run.table["commit"])),
+            word(", ".join(dict.fromkeys(_commit(made["commit"]) for made in run.makers))),
             number(run.table["threads"]),
             word(run.source),
         ]
@@ -136,15 +137,18 @@ def runs(comparison: Comparison) -> Table:
     return Table("Each run", headers, rows)
 
 
-def _dirty(commit: str | None) -> str:
-    return "-dirty" if commit and commit.endswith("-dirty") else ""
+def _setup(made: Row) -> str:
+    versions = ", ".join(f"{name} {number}" for name, number in made["versions"].items())
+    return f"{versions}; {made['machine']}, {made['threads']} threads"
+
+
+def _commit(full: str | None) -> str:
+    return (full or "none")[:12] + ("-dirty" if full and full.endswith("-dirty") else "")
 
 
 def made_with(comparison: Comparison) -> list[str]:
-    """Versions and machines of the runs, one line per combination."""
+    """Versions and machines of the runs and of what resumed them, one line per combination."""
     lines = [
-        ", ".join(f"{name} {number}" for name, number in run.table["versions"].items())
-        + f"; {run.table['machine']}, {run.table['threads']} threads"
-        for run in comparison.runs
+        line for run in comparison.runs for line in {_setup(made): None for made in run.makers}
     ]
     return [f"{line} ({lines.count(line)} runs)" for line in dict.fromkeys(lines)]

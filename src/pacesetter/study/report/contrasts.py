@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pacesetter.runs.directory import HORIZONS
 from pacesetter.study.compare import lineage, stats
 from pacesetter.study.compare.groups import Comparison, split
 from pacesetter.study.compare.stats import Array, Interval
@@ -102,6 +103,8 @@ def best_of_two(comparison: Comparison) -> list[Table]:
         half = control.cut(budget // 2)
         enough = min(len(run.steps) for run in half.runs) >= stats.FEWEST_EVALUATIONS
         enough = enough and half.budgets == [budget // 2]  # else no evaluation was there
+        # Half a run is no run of half the budget where a schedule was meant for the whole.
+        enough = enough and not any(run.settings.get(key) for run in half.runs for key in HORIZONS)
         one = stats.mean(control.values(comparison.metric))
         halves = stats.best_of_two(half.values(comparison.metric)) if enough else Interval(np.nan)
         both = stats.best_of_two(control.values(comparison.metric))

@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pacesetter.errors import TrainingError, UsageError
+from pacesetter.evaluation import recipe_of
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import Run
 
@@ -40,8 +41,7 @@ def _film(run: Run, allow: Collection[str]) -> Film:
         policy = load(run.folder / "policy.safetensors")
         with TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            own = policy.about.get("env")
-            env = own if own in allow else None
+            env = recipe_of(policy.about, None, allow=allow)
             record(policy, path, env=env, frames=FILM_FRAMES, size=FILM_SIZE)
             data = base64.b64encode(path.read_bytes()).decode()
     except (UsageError, TrainingError) as error:  # no reason to write no report

@@ -1,5 +1,7 @@
 """The result of a comparison in one sentence."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pacesetter.study.compare import stats
@@ -13,6 +15,17 @@ MOST = 6  # algorithms that a sentence names
 
 def headline(comparison: Comparison) -> str:
     """Who is ahead, by how much, and whether these runs can tell."""
+    metric = comparison.metric
+    known = [group for group in comparison.groups if np.isfinite(group.values(metric)).all()]
+    if not known:
+        return f"No {NAMES[metric].lower()} is known: no evaluation came after a first update."
+    unknown = [f"{x.name} on {x.env}" for x in comparison.groups if x not in known]
+    more = f"; and {len(unknown) - MOST} more" if len(unknown) > MOST else ""
+    rest = f" Not known, without an evaluation after the first update: {', '.join(unknown[:MOST])}"
+    return _sentence(replace(comparison, groups=known)) + (f"{rest}{more}." if unknown else "")
+
+
+def _sentence(comparison: Comparison) -> str:
     if len(comparison.groups) == 1:
         return _alone(comparison.groups[0], comparison.metric)
     if len(comparison.envs) == 1:
@@ -106,9 +119,8 @@ def _leaders(comparison: Comparison) -> str:
 
 
 def _mean(group: Group, metric: str) -> float:
-    """Mean over seeds; what is not known comes last."""
-    value = float(group.values(metric).mean())
-    return value if np.isfinite(value) else -np.inf
+    """Mean over seeds."""
+    return float(group.values(metric).mean())
 
 
 def _within(found: Interval) -> str:

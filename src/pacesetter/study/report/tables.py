@@ -55,7 +55,9 @@ def interval(found: Interval, digits: int = 0, after: str = "") -> Cell:
 
 
 def spread(value: float, deviation: float | None, after: str = "") -> Cell:
-    """A cell of a mean, its standard deviation if known, and words after it."""
+    """A cell of a mean, its standard deviation if known, and words after it; `-` without one."""
+    if np.isnan(value):
+        return Cell("-")
     known = deviation is not None and not np.isnan(deviation)
     return Cell(f"{value:,.1f}{f' ± {deviation:,.1f}' if known else ''}{after}", value)
 

@@ -75,6 +75,8 @@ class Tuning:
         for key in ("seed", "name"):
             if key in self.fixed:
                 raise UsageError(f"{key}: each trial sets its own; seeds start at {TUNING_SEEDS}")
+        if None in self.fixed.get("env_kwargs", {}).values():
+            raise UsageError("env: a keyword of none cannot be kept in a file of settings (TOML)")
         if not self.ranges:
             raise UsageError("tune: no setting is left to search; all are fixed or have no range")
         if not self.file.name or self.file.is_dir():
@@ -183,7 +185,7 @@ class Tuning:
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
             allow = [self.algorithm, self.env, *config.run.wrap]
-            trainer = Trainer.resume(directory.path, allow=allow)
+            trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow)
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
@@ -217,8 +219,12 @@ class Tuning:
 
 
 def _score(rows: list[Row]) -> float:
-    """Mean return of the last evaluations, a tenth of all or FEWEST; step 0 never counts."""
-    means = [row["mean"] for row in rows if row["kind"] == "eval" and row["step"] > 0]
+    """Mean return of the last evaluations, a tenth of all or FEWEST, after the first update.
+
+    Before that a policy says nothing of its settings; without any, all but step 0 count.
+    """
+    found = [row for row in rows if row["kind"] == "eval" and row["step"] > 0]
+    means = [row["mean"] for row in found if row["updates"] > 0] or [row["mean"] for row in found]
     return float(np.mean(means[-max(FEWEST, len(means) // 10) :]))
 
 
