@@ -20,8 +20,18 @@ GIVEN = {"algorithm", "env"}  # arguments of their own
 HEAD = '''"""Settings of a run as an editor sees them: written by scripts/typed_settings.py."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal, TypedDict
 
+'''
+TAIL = '''
+
+
+class TrainerSettings(RunSettings, total=False):
+    """And the folder of runs, and a file of settings."""
+
+    runs: str | Path
+    config: str | Path | None
 '''
 WIDTH = 100
 INDENT = "    "
@@ -46,7 +56,7 @@ def text() -> str:
     for name, (types, about) in found.items():
         if name not in GIVEN:
             lines += [f"    {name}: {' | '.join(simplest(types))}", f'    """{shortened(about)}"""']
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + TAIL
 
 
 def names() -> list[str]:

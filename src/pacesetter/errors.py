@@ -1,6 +1,8 @@
 """Errors for people, in one line: the field, what is wrong, what is allowed."""
 
-from collections.abc import Iterable
+import sys
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from traceback import extract_tb
@@ -38,6 +40,15 @@ class TrainingError(_OneLine):
 
 class TaskError(TrainingError):
     """A fault of the task: it raised, exited, or gave what it must not."""
+
+
+@contextmanager
+def told(what: str, *kinds: type[Exception]) -> Generator[None]:
+    """Tell errors of these kinds in a line on stderr instead of raising them."""
+    try:
+        yield
+    except kinds as error:
+        print(f"pacesetter: {what}: {reason(error)}", file=sys.stderr)
 
 
 def reason(error: BaseException) -> str:

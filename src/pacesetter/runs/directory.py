@@ -46,6 +46,7 @@ class RunDirectory:
         self.policies = path / "policies"  # of past evaluations, if they are kept
         self.state_file = path / "last" / "state.safetensors"
         self.previous_file = path / "last" / "previous.safetensors"
+        self.checkpoints = [self.state_file, self.previous_file]
         self.log = Log(self.metrics_file)
         self._lock = Lock(path / "lock")
         self._made: list[Path] = []  # folders that `create` made, the innermost first
@@ -66,9 +67,8 @@ class RunDirectory:
         return [file for file in found if present(file)]
 
     @property
-    def checkpoints(self) -> list[Path]:
-        """The newest first, whether they are there or not."""
-        return [self.state_file, self.previous_file]
+    def has_checkpoint(self) -> bool:
+        return any(map(present, self.checkpoints))
 
     def refuse_existing(self, config: Config) -> None:
         """Refuse to train where a run is already, and say what to do instead."""

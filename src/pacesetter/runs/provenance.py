@@ -39,7 +39,7 @@ def versions() -> dict[str, str]:
 def _processor() -> str:
     """Kind of processor, and on Linux its model, of which names alone often say little."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        lines = Path("/proc/cpuinfo").read_text("utf-8").split("\n\n")[0].splitlines()
     except OSError:
         return platform.processor() or platform.machine()
     found = {name.strip(): value.strip() for name, _, value in (x.partition(":") for x in lines)}

@@ -1,6 +1,7 @@
 """Settings of a run as an editor sees them: written by scripts/typed_settings.py."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal, TypedDict
 
 # fmt: off
@@ -263,3 +264,10 @@ class RunSettings(TypedDict, total=False):
     """policy updates without a kept policy that end it"""
     share: float
     """share of models that must not see a fall"""
+
+
+class TrainerSettings(RunSettings, total=False):
+    """And the folder of runs, and a file of settings."""
+
+    runs: str | Path
+    config: str | Path | None

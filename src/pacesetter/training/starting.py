@@ -15,12 +15,14 @@ from pacesetter.runs import find
 
 
 def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
-    """Give every member what `--start-from` names; the replay, the counters and noise start anew.
+    """Give every member what `--start-from` names, if it names anything.
 
-    A run gives the whole state of its champion, optimiser state included, and the statistics that
-    normalize observations and rewards. A policy file gives the actor alone. Raises UsageError if it
-    does not fit this run.
+    The replay, the counters and noise start anew. A run gives the whole state of its champion,
+    optimiser state included, and the statistics that normalize observations and rewards. A policy
+    file gives the actor alone. Raises UsageError if it does not fit this run.
     """
+    if config.run.start_from is None:
+        return
     source = str(config.run.start_from)
     try:
         if Path(source).suffix == ".safetensors":

@@ -12,10 +12,8 @@ from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.members import Members
 from pacesetter.ensemble.progress import Progress
 from pacesetter.envs import apart
-from pacesetter.envs.apart import Apart
 from pacesetter.envs.tasks import Factory, name_of
-from pacesetter.errors import TaskError, TrainingError, UsageError, reason
-from pacesetter.files import present
+from pacesetter.errors import TaskError, TrainingError, UsageError, told
 from pacesetter.learner import products
 from pacesetter.learner.backend import made_with, prepare
 from pacesetter.policy import Policy
@@ -32,11 +30,7 @@ from pacesetter.training.starting import start_from
 from pacesetter.training.tasks import make_tasks
 
 if TYPE_CHECKING:
-    from pacesetter.settings.typed import Name, RunSettings
-
-    class Settings(RunSettings, total=False):
-        runs: str | Path
-        config: str | Path | None
+    from pacesetter.settings.typed import Name, TrainerSettings
 
 
 class Trainer:
@@ -44,7 +38,7 @@ class Trainer:
 
     @overload
     def __init__(
-        self, algorithm: "Name", env: str | Factory, **settings: "Unpack[Settings]"
+        self, algorithm: "Name", env: str | Factory, **settings: "Unpack[TrainerSettings]"
     ) -> None: ...
 
     @overload  # presets and algorithms of other people
@@ -72,8 +66,7 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
         self._begin(None, env)
-        if self.config.run.start_from is not None:
-            start_from(self.loop, self.config, runs)
+        start_from(self.loop, self.config, runs)
         self.directory.create(self.config, **self._made_with)
         try:
             self.loop.open_replays(self.directory.state_file.parent)
@@ -121,9 +114,9 @@ class Trainer:
         try:
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
-            begun = any(map(present, self.directory.checkpoints))
+            begun = self.directory.has_checkpoint
             notes = checkpoint.restore(self.loop, self.config, self.directory)
-            if not begun and self.config.run.start_from is not None:
+            if not begun:
                 start_from(self.loop, self.config, runs)
             self.notes += [*self.directory.notes, *notes]
             if self.progress.step > self.budget:
@@ -139,7 +132,7 @@ class Trainer:
         done = f"{self.progress.step:,} of {self.budget:,} steps"
         return f"Trainer({run.name} on {run.env}, seed {run.seed}: {done}, {self.directory.path})"
 
-    def _begin(self, before: Apart | None, env: str | Factory | None) -> None:
+    def _begin(self, before: apart.Apart | None, env: str | Factory | None) -> None:
         """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
         tasks = make_tasks(self.config, before, env)
         self.apart = tasks.apart
@@ -174,10 +167,8 @@ class Trainer:
                     self._reporter.add("select", selection.row())
             self.save()
         except GeneratorExit:
-            try:
+            with told("not saved", OSError, TrainingError):  # Python would pass over it
                 self.save()
-            except (OSError, TrainingError) as error:  # Python would pass over what is raised here
-                print(f"pacesetter: not saved: {reason(error)}", file=sys.stderr)
             raise
         except TaskError:
             if self.loop.whole:
@@ -188,8 +179,7 @@ class Trainer:
             where = f"step {self.progress.step}: {self.directory.path}"
             raise TrainingError(f"{where}: {error.strerror or error}") from error
         finally:
-            failed = sys.exception() is not None  # and is the error to be seen
-            with suppress(TaskError) if failed else nullcontext():
+            with suppress(TaskError) if sys.exception() else nullcontext():  # the first is seen
                 self.close()
 
     @property
@@ -242,8 +232,9 @@ class Trainer:
 
     def _refuse_closed(self) -> None:
         if self._closed:
-            path = self.directory.path
-            raise UsageError(f"run: this trainer has ended; Trainer.resume('{path}')")
+            raise UsageError(
+                f"run: this trainer has ended; Trainer.resume('{self.directory.path}')"
+            )
 
     def policy(self, member: int | None = None) -> Policy:
         """The policy of the champion, or of a member, as it is now, and where it comes from."""
