@@ -125,7 +125,8 @@ def test_a_task_that_is_made_anew_is_filmed_alike(
     assert len(kept) == len(renewed)
     for one, other in zip(kept, renewed, strict=True):
         assert one.shape == other.shape
-        assert np.abs(one.astype(int) - other).mean() < 1  # of 256; a light may lag at a reset
+        # Of 256: a used renderer's first frame differs by 3, and a palette makes more of that.
+        assert np.abs(one.astype(int) - other).mean() < 1
 
 
 @pytest.mark.parametrize("rate", [20.0, 30.0, 125 / 3, 50.0])
