@@ -21,10 +21,10 @@ def made(runs: Path, env: str, name: str) -> RunDirectory:
 
 
 NAMES = {
-    "mywalker:MyPend-v0": ["mywalker:MyPend-v0", "mywalker-MyPend-v0", "MyPend-v0"],
+    "mywalker:MyPend-v0": ["mywalker:MyPend-v0", "mywalker-MyPend-v0", "MyPend-v0", "MyPend"],
     "my:dm_control/run-v0": ["my:dm_control/run-v0", "dm_control/run-v0", "run-v0",
                              "my-dm_control-run-v0"],
-    "Pendulum-v1": ["Pendulum-v1"],
+    "Pendulum-v1": ["Pendulum-v1", "Pendulum"],
 }  # fmt: skip
 
 
@@ -34,6 +34,7 @@ def test_every_spelling_of_a_task(env: str, runs: Path) -> None:
     other = made(runs, "Ant-v5", "td3")
     for typed in NAMES[env]:
         assert find(f"{typed}/td3/0", runs).path == one.path, typed
+        assert find(f"{typed}/td3", runs).path == one.path, f"{typed}, whose only seed this is"
         assert [run.path for run in find_group(f"{typed}/td3", runs)] == [one.path], typed
         assert [run.path for run in find_matching(f"{typed}/*", runs)] == [one.path], typed
         assert find(f"{runs}/{typed}/td3/0", runs).path == one.path, typed

@@ -2,18 +2,21 @@
 
 import math
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pacesetter import storage
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, unknown
 from pacesetter.networks.forward import ACTIVATIONS, ENCODER, OUTPUTS, clip, forward, has_encoder
 from pacesetter.text import check_id
 from pacesetter.types import Floats, Layers, Shape
 
 KIND = "policy"
+SUFFIX = ".safetensors"
+CHAMPION = "champion:"
 SCHEMA = 1
 LAYERS = (
     {"kernel", "bias"},
@@ -123,9 +126,27 @@ def unstack(stacked: Any) -> list[Layers]:
     ]
 
 
+def champions() -> dict[str, Path]:
+    """Shipped policies by name: inside an installed package, beside `src` in a checkout."""
+    inside = Path(str(files("pacesetter"))) / "champions"
+    folder = inside if inside.is_dir() else Path(__file__).parents[2] / "champions"
+    return {file.stem: file for file in sorted(folder.glob("*.safetensors"))}
+
+
+def file_of(name: str | Path) -> Path | None:
+    """The policy file that a name means, its path or `champion:NAME`; None if it means none."""
+    word = str(name)
+    if not word.startswith(CHAMPION):
+        return Path(name) if Path(name).suffix == SUFFIX else None
+    known, short = champions(), word.removeprefix(CHAMPION)
+    if short not in known:
+        raise unknown("champion", short, known, "pacesetter list champions")
+    return known[short]
+
+
 def load(path: str | Path) -> Policy:
-    """The policy of a policy file; nothing in the file is executed or imported."""
-    path = Path(path)
+    """The policy of a file, or `champion:NAME`; nothing in the file is executed or imported."""
+    path = file_of(path) or Path(path)
     # A person, or the hub's cache, may name a link.
     arrays, table = storage.read(path.resolve() if path.is_symlink() else path, KIND)
     if table.get("schema") != SCHEMA:

@@ -65,7 +65,7 @@ def test_a_run_of_days_is_said_once() -> None:
 
 def test_a_run_of_hours_is_not() -> None:
     assert Clockwork("crossq", 100.0).lines(200) == []
-    assert Clockwork("crossq", 2.0, time="8h").lines(200) == []
+    assert Clockwork("crossq", 100.0, time="8h").lines(200) == []
 
 
 def test_settings_too_slow_for_the_machine_are_said_however_short_the_run() -> None:
@@ -78,6 +78,32 @@ def test_settings_too_slow_for_the_machine_are_said_however_short_the_run() -> N
     assert "about 17 minutes" in line
     assert Clockwork("crossq", 0.5, steps=5_200).lines(200) == [], "seven minutes are borne"
     assert Clockwork("crossq", 6.0, steps=20_000).lines(200) == [], "42 minutes of a usual speed"
+
+
+def test_a_limit_of_time_does_not_make_slow_settings_bearable() -> None:
+    """Half an hour of crossq at 0.3 updates per second would be 540 updates."""
+    (line,) = Clockwork("crossq", 0.3, time="30m").lines(200)
+    assert "and --time ends it after 30 minutes" in line
+    assert "such as --time" not in line
+    assert Clockwork("crossq", 0.3, time="5m").lines(200) == [], "five minutes are borne"
+
+
+def test_bench_says_it_of_each_entry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["bench", "--algos", "td3", "ddpg", "--envs", TASK, "--seeds", "2", "--steps", "50",
+             "--jobs", "1", "--runs", str(tmp_path), *FLAGS]  # fmt: skip
+    assert main(words) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "warm-up" in line]
+    assert [line.split(":")[1] for line in lines] == [f" {TASK} td3", f" {TASK} ddpg"]
+    assert main([*words, "--quiet"]) == 0
+
+
+def test_a_resumed_run_knows_its_best() -> None:
+    trainer: Any = Clockwork("td3", 1.0, steps=30_000)
+    trainer.progress = SimpleNamespace(
+        step=6_000, next_evaluation=10_000, wall_seconds=0.0, ended=[], best=12.5
+    )
+    assert View(trainer).returns() == "return - (best 12.5)"
+    assert View(trainer).speed().endswith("  - steps/s"), "no step was seen yet"
 
 
 def test_the_view_names_the_phase() -> None:

@@ -18,13 +18,12 @@ from policies import untrained
 from short_runs import TINY, run_to_end
 
 from pacesetter.cli.main import main
-from pacesetter.cli.policies import champions
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media import hub
 from pacesetter.media.record import INSTALL
 from pacesetter.media.record import record as film
-from pacesetter.policy import load
+from pacesetter.policy import champions, load
 from pacesetter.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]

@@ -22,7 +22,7 @@ from pacesetter.evaluation import evaluate
 from pacesetter.media.caption import caption
 from pacesetter.media.curve import curve
 from pacesetter.media.record import INSTALL, duration, record
-from pacesetter.media.scene import draw, scene
+from pacesetter.media.scene import draw, gl, scene
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 
@@ -172,6 +172,32 @@ def test_missing_gl_is_one_line_that_says_what_to_install(
         record(cheetah, tmp_path / "film.mp4")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("system", "display", "told", "drawn_by"),
+    [
+        ("linux", None, None, "egl"),
+        ("linux", ":0", None, None),
+        ("linux", None, "osmesa", "osmesa"),
+        ("darwin", None, None, None),
+    ],
+)
+def test_egl_is_for_a_linux_without_display(
+    system: str,
+    display: str | None,
+    told: str | None,
+    drawn_by: str | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "platform", system)
+    for name, value in (("DISPLAY", display), ("MUJOCO_GL", told)):
+        monkeypatch.delenv(name, raising=False)
+        if value:
+            monkeypatch.setenv(name, value)
+    with gl():
+        assert os.environ.get("MUJOCO_GL") == drawn_by
+    assert os.environ.get("MUJOCO_GL") == told
 
 
 def test_mujoco_that_cannot_even_be_imported_is_the_same_line(tmp_path: Path) -> None:

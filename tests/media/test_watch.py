@@ -8,6 +8,7 @@ import sys
 import urllib.request
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -50,8 +51,28 @@ def test_without_display_and_page_one_line_points_to_record(
     with pytest.raises(UsageError, match="episodes: must be at least 1"):
         watch(cheetah, episodes=0)
     monkeypatch.setenv("DISPLAY", ":0")
-    with pytest.raises(UsageError, match="no mjviser for a page; pip install mjviser"):
+    with pytest.raises(
+        UsageError, match=r"no mjviser for a page; pip install 'pacesetter\[watch\]'"
+    ):
         watch(cheetah, browser=True)
+
+
+@pytest.mark.usefixtures("bare")
+def test_a_mac_has_a_window_without_the_names_of_x11(
+    cheetah: Policy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Policy] = []
+    monkeypatch.setattr(module, "_window", lambda policy, world, episodes: shown.append(policy))
+    monkeypatch.setattr(module, "enter", lambda *given, **more: SimpleNamespace(close=list))
+    monkeypatch.setattr(sys, "platform", "darwin")
+    watch(cheetah)
+    assert shown == [cheetah]
+
+
+@pytest.mark.parametrize("port", [0, -1, 99_999])
+def test_a_port_that_there_is_not(cheetah: Policy, port: int) -> None:
+    with pytest.raises(UsageError, match=rf"port: must be from 1 to 65535, got {port}"):
+        watch(cheetah, browser=True, port=port)
 
 
 class Shown(gymnasium.Env[Any, Any]):

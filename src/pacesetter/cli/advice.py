@@ -60,7 +60,7 @@ class Slowness:
         self._over = True
         speed = made / seconds
         left, limit = self._left() / speed, self._trainer.config.run.time
-        bearable = SOON if speed < SLOW and limit is None else LONG
+        bearable = SOON if speed < SLOW else LONG
         return self._line(speed, left) if min(left, limit or inf) > bearable else None
 
     def _left(self) -> float:
@@ -70,9 +70,11 @@ class Slowness:
         return steps * hyper.updates_per_step
 
     def _line(self, speed: float, seconds: float) -> str:
+        limit = self._trainer.config.run.time
+        cut = f", and --time ends it after {_long(limit)}" if limit and limit < seconds else ""
         return (
             f"at {speed:.2g} updates per second this run takes about {_long(seconds)} on this "
-            f"machine; {_remedy(self._trainer.config)}; Ctrl-C saves"
+            f"machine{cut}; {_remedy(self._trainer.config)}; Ctrl-C saves"
         )
 
 
@@ -94,4 +96,5 @@ def _remedy(config: "Config") -> str:
         widths = getattr(config.hyper, name, ())
         if any(width > WIDE for width in widths):
             ways.append(f"give --{name.replace('_', '-')} {' '.join([str(WIDE)] * len(widths))}")
-    return ", or ".join([*ways, "fewer --steps", "a limit such as --time 8h"])
+    limits = [] if config.run.time else ["a limit such as --time 8h"]
+    return ", or ".join([*ways, "fewer --steps", *limits])

@@ -132,6 +132,8 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
     work = Bench(jobs)
     with aside():
         work.check_envs()
+    if not own["quiet"]:
+        _warn(work.left)
     executor = _executor(own)
     with (
         stopping(work.stop, lambda: work.kill(executor)) as received,
@@ -149,6 +151,16 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
         print(f"saved; go on with `pacesetter bench {shlex.join(words)}`")
         return exit_code(received)
     return 1 if work.failed else 0
+
+
+def _warn(jobs: list[suites.Job]) -> None:
+    """Say once of each entry and task that its budget ends within the warm-up."""
+    from pacesetter.cli.advice import within_warmup
+
+    lines = {(job.config.run.env, job.config.run.name): within_warmup(job.config) for job in jobs}
+    for (env, name), line in lines.items():
+        if line:
+            print(f"pacesetter: {env} {name}: {line}", file=sys.stderr)
 
 
 def _executor(own: dict[str, Any]) -> Any:

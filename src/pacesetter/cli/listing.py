@@ -91,8 +91,7 @@ def suites() -> list[Row]:
 
 def champions() -> list[Row]:
     """Policies that come with the package."""
-    from pacesetter.cli.policies import CHAMPION, champions
-    from pacesetter.policy import load
+    from pacesetter.policy import CHAMPION, champions, load
 
     found = [(name, load(file).about) for name, file in champions().items()]
     return [

@@ -1,20 +1,18 @@
 """Which policy a word of the command line means: a run's, a file's or a shipped champion's."""
 
 from argparse import Namespace
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pacesetter.cli.flags import Parser, split_env_kwargs
 from pacesetter.consent import require
-from pacesetter.errors import UsageError, unknown
+from pacesetter.errors import UsageError
 from pacesetter.files import NOT_REGULAR, is_regular, present
 from pacesetter.settings import Settings
 
 if TYPE_CHECKING:
     from pacesetter.policy import Policy
 
-CHAMPION = "champion:"
 RUN = "run folder, the end of its path, a policy file, or champion:NAME"
 
 
@@ -92,37 +90,16 @@ def _wrap(about: dict[str, Any], env: str | None, given: Namespace) -> tuple[str
     return tuple(given.wrap or own)
 
 
-def is_file(run: str) -> bool:
-    """Whether a policy file is meant, or a shipped champion, and no run."""
-    return run.startswith(CHAMPION) or Path(run).suffix == ".safetensors"
-
-
 def policy_file(run: str, runs: str) -> Path:
-    """The policy file that is meant."""
+    """The policy file that is meant: a run's, a file itself or a shipped champion."""
+    from pacesetter.policy import file_of
     from pacesetter.runs import find
 
-    if run.startswith(CHAMPION):
-        return champion(run.removeprefix(CHAMPION))
-    if is_file(run):
-        return Path(run)
+    if file := file_of(run):
+        return file
     found = find(run, runs)
     if not present(found.policy_file):
         raise UsageError(f"run: {found.path} has no policy yet; it comes with its first evaluation")
     if not is_regular(found.policy_file):
         raise UsageError(f"run: {found.policy_file} {NOT_REGULAR}")
     return found.policy_file
-
-
-def champion(name: str) -> Path:
-    """The file of a shipped policy."""
-    known = champions()
-    if name not in known:
-        raise unknown("champion", name, known, "pacesetter list champions")
-    return known[name]
-
-
-def champions() -> dict[str, Path]:
-    """Shipped policies by name: inside an installed package, beside `src` in a checkout."""
-    inside = Path(str(files("pacesetter"))) / "champions"
-    folder = inside if inside.is_dir() else Path(__file__).parents[3] / "champions"
-    return {file.stem: file for file in sorted(folder.glob("*.safetensors"))}

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from datetime import timedelta
 from math import inf
@@ -45,17 +45,25 @@ def _time(seconds: float) -> str:
 
 
 def bars() -> "Progress":
-    """Bars on stderr: a name, how far it is, and a `note`."""
-    from rich.console import Console
+    """Bars on stderr, as wide as the terminal: a name, how far it is, and below it a `note`."""
+    from rich.console import Console, RenderableType
     from rich.progress import BarColumn, Progress, TextColumn
+    from rich.text import Text
+
+    class Bars(Progress):
+        def get_renderables(self) -> Iterable[RenderableType]:
+            for task in self.tasks:
+                yield self.make_tasks_table([task])
+                if task.fields["note"]:
+                    yield Text(task.fields["note"])  # wraps where the terminal is narrow
 
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=None),
         TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-        TextColumn("{task.fields[note]}"),
     )
-    return Progress(*columns, console=Console(stderr=True), refresh_per_second=2)
+    console = Console(stderr=True)
+    return Bars(*columns, console=console, refresh_per_second=2, expand=True)
 
 
 class View:
@@ -66,7 +74,8 @@ class View:
         self._warmup = int(getattr(trainer.config.hyper, "warmup", 0))
         self._began = time.monotonic() - trainer.progress.wall_seconds
         self._phase, self._pace = "", self._new_pace()
-        self._last = self._best = "-"
+        best = trainer.progress.best  # a resumed run has one
+        self._last, self._best = "-", "-" if best is None else f"{best:,.1f}"
         self._returns: dict[int, float] = {}  # of each member's last training episode
 
     def take(self, report: "Report") -> None:
@@ -100,7 +109,8 @@ class View:
         most = self._limit - (now - self._began)
         speed, left = self._pace.read(step, now, self._trainer.budget, most)
         left = left if step >= self._warmup else "after the warm-up"
-        return f"{_time(now - self._began)} elapsed  ETA {left}  {speed:,.1f} steps/s"
+        shown = f"{speed:,.1f}" if speed else "-"
+        return f"{_time(now - self._began)} elapsed  ETA {left}  {shown} steps/s"
 
     def returns(self) -> str:
         """The last and the best evaluation, and each member's last training return."""
@@ -164,7 +174,7 @@ def _lines(trainer: "Trainer", view: View) -> Generator[Any]:
             result = f"return {report.values['mean']:.1f} +- {report.values['std']:.1f}"
             _say(f"step {report.step:,} of {trainer.budget:,}  {view.phase}  {result}  {speed}")
 
-    yield show, lambda: None, _say
+    yield show, view.speed, _say
 
 
 @contextmanager

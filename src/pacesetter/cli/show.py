@@ -7,7 +7,7 @@ from typing import Any
 from tabulate import tabulate
 
 from pacesetter.cli.flags import parser
-from pacesetter.cli.policies import RUN, is_file, policy_file
+from pacesetter.cli.policies import RUN
 from pacesetter.errors import UsageError
 from pacesetter.runs import Row, RunDirectory, find
 from pacesetter.settings.budget import budget, is_spent, standing
@@ -31,8 +31,10 @@ def show(words: list[str]) -> int:
     command.add_argument("--json", action="store_true", help="print everything as a JSON object")
     command.add_runs()
     found = command.parse(words)
-    if is_file(found.run):
-        told = tell_policy(policy_file(found.run, found.runs))
+    from pacesetter.policy import file_of
+
+    if file := file_of(found.run):
+        told = tell_policy(file)
         print(as_json(told) if found.json else _policy_text(told))
         return 0
     run = find(found.run, found.runs)

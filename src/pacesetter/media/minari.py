@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pacesetter.envs import Environment, Recipe
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, reason
 from pacesetter.evaluation import enter
 from pacesetter.media.extras import need
 from pacesetter.media.scene import setting
@@ -61,6 +61,8 @@ def to_minari(
             Path(root, path.name).rename(path)
     except OSError as error:
         raise UsageError(f"minari: cannot write {path}: {error.strerror or error}") from None
+    except ValueError as error:  # such as a space that it has no form for
+        raise UsageError(f"minari: cannot write {path}: {reason(error)}") from None
     finally:
         world.close()
     return returns

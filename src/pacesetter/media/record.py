@@ -109,7 +109,7 @@ def _write(path: Path, film: Iterator[Frame], rate: float) -> int:
                 writer.append_data(frame)
                 durations.append(duration(number, rate))
     except OSError as error:
-        reason = error.strerror or str(error).splitlines()[0]
+        reason = error.strerror or next(iter(str(error).splitlines()), type(error).__name__)
         raise UsageError(f"video: cannot write {path}: {reason}") from None
     return len(durations)
 

@@ -75,8 +75,9 @@ def to_sb3(
     if task.name.startswith(FUNCTION):
         raise UsageError(f"env: '{task.name}' was given as a function, which no script can name")
     file = path.with_suffix(".safetensors")
-    if file.exists():
-        raise UsageError(f"sb3: {file} exists; give {path.name} another name")
+    for made in (path, file):
+        if made.exists():
+            raise UsageError(f"sb3: {made} exists; give {path.name} another name")
     given = [task.name, task.kwargs, task.wrap]
     while not given[-1]:
         given.pop()

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import sys
 from collections.abc import Generator
 from contextlib import closing, contextmanager
 from functools import partial
@@ -85,7 +86,7 @@ def check_folder(what: str, path: Path) -> None:
 
 @contextmanager
 def gl() -> Generator[None]:
-    """Let MuJoCo draw by EGL where no display is, and only in here.
+    """Let MuJoCo draw by EGL on a Linux without a display, and only in here.
 
     MuJoCo comes first: with MUJOCO_GL=egl and no EGL it could never be imported again.
     """
@@ -94,7 +95,8 @@ def gl() -> Generator[None]:
     except Exception:
         raise _no_gl() from None
     chosen = os.environ.get("MUJOCO_GL")
-    with setting("MUJOCO_GL", chosen if chosen or os.environ.get("DISPLAY") else "egl"):
+    by_egl = not chosen and sys.platform == "linux" and not os.environ.get("DISPLAY")
+    with setting("MUJOCO_GL", "egl" if by_egl else chosen):
         yield
 
 
@@ -114,9 +116,8 @@ def setting(name: str, value: str | None) -> Generator[None]:
 
 def _no_gl() -> UsageError:
     backend = os.environ.get("MUJOCO_GL", "unset")
-    return UsageError(
-        f"video: no OpenGL to draw with (MUJOCO_GL={backend}); MUJOCO_GL=egl needs `{INSTALL}`"
-    )
+    linux = f"; MUJOCO_GL=egl needs `{INSTALL}`" if sys.platform == "linux" else ""
+    return UsageError(f"video: no OpenGL to draw with (MUJOCO_GL={backend}){linux}")
 
 
 def is_mujoco(world: Environment) -> bool:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
@@ -17,7 +18,7 @@ from pacesetter.media.scene import FOLLOW, camera_number, is_mujoco, lay_floor
 from pacesetter.policy import Policy
 from pacesetter.types import Floats
 
-INSTALL = "mjviser"  # no extra of ours: viser 1.1 wants an older rich than our progress bars
+INSTALL = "pacesetter[watch]"
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 FILM = "make a film with `pacesetter record`"
 DISTANCE = 4.0  # metres from the walker where the task names none
@@ -41,6 +42,8 @@ def watch(
     """
     if episodes is not None and episodes < 1:
         raise UsageError(f"episodes: must be at least 1, got {episodes}")
+    if not 0 < port < 2**16:
+        raise UsageError(f"port: must be from 1 to 65535, got {port}")
     page = _wants_page(browser)
     task = recipe_of(policy.about, env, env_kwargs)
     try:
@@ -57,14 +60,14 @@ def watch(
 
 def _wants_page(browser: bool | None) -> bool:
     """Whether to show a page rather than a window, or one line if neither can be."""
-    display = any(os.environ.get(name) for name in DISPLAYS)
+    display = sys.platform == "darwin" or any(os.environ.get(name) for name in DISPLAYS)
     if display and not browser:
         return False
     if browser is False:
         raise UsageError(f"watch: no display for a window (DISPLAY is not set); {FILM}")
     if find_spec("mjviser") is None:
         what = "no mjviser" if display else "no display for a window and no mjviser"
-        raise UsageError(f"watch: {what} for a page; pip install {INSTALL}, or {FILM}")
+        raise UsageError(f"watch: {what} for a page; pip install '{INSTALL}', or {FILM}")
     return True
 
 

@@ -1,6 +1,7 @@
 """Runs by the names that people type."""
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from glob import glob
 from pathlib import Path, PurePath
@@ -10,6 +11,7 @@ from pacesetter.files import present
 from pacesetter.runs.directory import CONFIG, RunDirectory
 
 SHOWN = 4  # runs that a refusal names
+VERSION = re.compile(r"-v\d+$")  # of a Gymnasium id
 
 
 def find_all(runs: str | Path = "runs") -> Iterator[RunDirectory]:
@@ -35,15 +37,23 @@ def _folders(runs: Path) -> Iterator[Path]:
 
 
 def find(name: str, runs: str | Path = "runs") -> RunDirectory:
-    """A run by its path, or by an end of its path or of its name that only one run has."""
+    """A run by its path, or by an end of its path or of its name that only one run has.
+
+    The seed may be left out where there is only one, and the version of the task.
+    """
     if present(Path(name) / CONFIG):
         return RunDirectory(Path(name))
     parts = _plain(name).parts
     found = _called(runs, lambda path: path.parts[-len(parts) :] == parts)
+    found = found or find_group(name, runs)
     if len(found) == 1:
         return found[0]
     if found:
         raise UsageError(f"run: '{name}' matches {_few(found)}")
+    from pacesetter.policy import file_of
+
+    if file_of(name):
+        raise UsageError(f"run: {name} is a policy file; give a run, which has a log and states")
     known = list(find_all(runs))
     near = f"; there are {_few(known)}" if known else f"; no runs below {runs}"
     raise UsageError(f"run: '{name}' not found{near}")
@@ -84,7 +94,7 @@ def _called(runs: str | Path, fits: Callable[[PurePath], bool]) -> list[RunDirec
 
 
 def _spellings(run: RunDirectory) -> Iterator[PurePath]:
-    """The run's folder with its task as it was typed, and as it is without its module.
+    """The run's folder with its task as it was typed, and without its module or its version.
 
     The folder of `module:Id-v0` is module-Id-v0, and that of `group/Id-v0` group-Id-v0.
     """
@@ -93,8 +103,9 @@ def _spellings(run: RunDirectory) -> Iterator[PurePath]:
     except UsageError:  # damaged, which is for its own commands to say
         return
     *above, _, name, seed = ("", "", *run.path.parts)
-    for typed in (_plain(env), PurePath(env.split(":")[-1]), PurePath(PurePath(env).name)):
+    for typed in (str(_plain(env)), env.split(":")[-1], PurePath(env).name):
         yield PurePath(*above, typed, name, seed)
+        yield PurePath(*above, VERSION.sub("", typed), name, seed)
 
 
 def _plain(name: str) -> PurePath:

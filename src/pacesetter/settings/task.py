@@ -66,7 +66,8 @@ class Task:
     start_from: str | None = Field(
         None,
         min_length=1,
-        description="start all members with the networks of this earlier run or policy file",
+        description="start all members with the networks of this earlier run, policy file or "
+        "champion:NAME",
     )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of every random stream")
     env_timeout: Duration | None = Field(

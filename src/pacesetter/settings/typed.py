@@ -31,7 +31,7 @@ class RunSettings(TypedDict, total=False):
     stop_patience: int | None
     """stop after so many evaluations in a row, from the first update on, without a new best..."""
     start_from: str | None
-    """start all members with the networks of this earlier run or policy file"""
+    """start all members with the networks of this earlier run, policy file or champion:NAME"""
     seed: int
     """seed of every random stream"""
     env_timeout: float | str | None

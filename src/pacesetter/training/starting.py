@@ -25,8 +25,8 @@ def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
         return
     source = str(config.run.start_from)
     try:
-        if Path(source).suffix == ".safetensors":
-            _from_policy(loop, config, Path(source))
+        if file := policy.file_of(source):
+            _from_policy(loop, config, file)
         else:
             _from_run(loop, config, source, runs)
     except storage.FAULTS as error:
