@@ -18,7 +18,14 @@ TRAIN = (
     "train td3 Pendulum-v1 --steps 300 --warmup 100 --eval-every 200 --eval-episodes 1 "
     "--hidden 16 16 --quiet"
 )
-COMMANDS = ("--version", "--help", "list algorithms", TRAIN, "eval Pendulum-v1/td3/0 --episodes 1")
+COMMANDS = (
+    "--version",
+    "--help",
+    "list algorithms",
+    TRAIN,
+    "eval Pendulum-v1/td3/0 --episodes 1",
+    "record champion:HalfCheetah-v4-sac --frames 2 -o walk.gif",
+)
 
 
 def interpreter(version: str) -> str | None:

@@ -21,6 +21,7 @@ from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms import crossq
 from pacesetter.config import resolve
+from pacesetter.errors import UsageError
 from pacesetter.networks import batch_renorm
 from pacesetter.policy import Policy, unstack
 from pacesetter.training.trainer import Trainer
@@ -284,3 +285,14 @@ def test_presets(name: str, width: int) -> None:
     state = jax.eval_shape(crossq.CrossQ(SPEC, hyper).init, KEY)
     shapes = [layer["kernel"].shape for layer in state.critic]
     assert shapes == [(2, 5, width), (2, width, width), (2, width, 1)]
+
+
+def test_renorm_after_is_compared_with_a_counter_of_32_bits() -> None:
+    assert renormed(2**31 - 1) == 2**31 - 1
+    with pytest.raises(UsageError, match="renorm_after"):
+        renormed(2**31)
+
+
+def renormed(after: int) -> int:
+    settings: Any = resolve("crossq", "Pendulum-v1", {"renorm_after": after})
+    return settings.hyper.renorm_after

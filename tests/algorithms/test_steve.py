@@ -218,7 +218,7 @@ def test_each_model_and_critic_learns_from_rows_of_its_own(
     """Other rewards in row 1 change model 1 and critic 1 alone, once targets are given."""
     algorithm, state, _ = steve
     batch, other = rows(16), rows(16)
-    other.reward[1] += 1
+    other.reward[1] += 100  # so that signs of gradients change, which is all a first Adam step sees
     monkeypatch.setattr(Dynamics, "observe", lambda self, models, batch: models)  # is for all
     fit = compiled(algorithm.fit_models)
     one, two = fit(state, batch)[0].models, fit(state, other)[0].models
@@ -226,7 +226,7 @@ def test_each_model_and_critic_learns_from_rows_of_its_own(
         networks = [jax.tree.map(lambda x, i=index: x[i], m.networks) for m in (one, two)]
         assert same(*networks) != moved
     routes = np.asarray(algorithm.routes(16))
-    np.testing.assert_array_equal(routes, [[1, 0] * 8, [0, 1] * 8])
+    np.testing.assert_array_equal(routes, [[2, 0] * 8, [0, 2] * 8])  # means of its own rows
     fit_critic = compiled(algorithm.fit_critic)
     one, two = (
         fit_critic(state, batch, x.reward, batch.weight * routes)[0].critic for x in (batch, other)
@@ -248,7 +248,7 @@ def test_every_row_is_dealt_to_a_model() -> None:
 
 def test_pairs_of_twins_share_their_rows() -> None:
     algorithm = learner("steve-td3", batch_size=4, **SMALL)
-    expected = [[1, 0, 1, 0]] * 2 + [[0, 1, 0, 1]] * 2
+    expected = [[2, 0, 2, 0]] * 2 + [[0, 2, 0, 2]] * 2
     np.testing.assert_array_equal(algorithm.routes(4), expected)
 
 

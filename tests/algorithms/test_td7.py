@@ -533,3 +533,10 @@ def test_presets() -> None:
     assert (hyper.warmup, hyper.exploration_noise) == (25_000, 0.1)
     small = resolve("td7-small", "Walker2d-v5").hyper
     assert (small.batch_size, small.encoder_hidden, small.encoder_size) == (128, (96, 96), 96)
+
+
+def test_a_copy_that_td7_cannot_make_is_refused_before_anything_is_written(runs: Path) -> None:
+    settings = RUN | {"members": 2, "rule": "best", "copy": "actor"}
+    with pytest.raises(UsageError, match="copy: an actor of td7 reads its own encoder"):
+        Trainer("td7", "Pendulum-v1", runs=runs, **settings)
+    assert not runs.exists()

@@ -151,3 +151,16 @@ def test_a_mean_of_states_has_played_no_episode_yet(runs: Path) -> None:
     checkpoints.copy(parents, averaged=True)
     assert [each.returns for each in checkpoints.assessments] == [[], []]
     trainer.close()
+
+
+def test_copies_that_come_more_often_than_episodes_end_do_not_stop_learning(runs: Path) -> None:
+    """Everyone is averaged after each 10 own steps, in the middle of episodes of 25: no policy can
+    be assessed, but the updates that wait are made when an episode ends.
+    """
+    trainer = assessed(
+        runs, ([5], [7]), lengths=(25, 25), members=2, rule="average", select_on="eval",
+        select_every=20, count_selection_steps=False, wait=False, steps=200,
+    )  # fmt: skip
+    run_to_end(trainer)
+    assert not any(row.get("assessed") for row in log(trainer.directory))
+    assert trainer.progress.updates == 200

@@ -86,6 +86,7 @@ REFUSED: list[tuple[Any, str]] = [
     (np.zeros((3, 1)), r"must have shape \(3,\) as its space, has \(3, 1\)"),
     ([0.0, 1e300, 0.0], r"must be finite and at most 1.8e\+19 in size, number 1 is 1e\+300"),
     (np.float32([-1e38, 0, 0]), r"must be finite and at most .*, number 0 is -\S+e\+3[78]"),
+    (np.float16([0, np.inf, 0]), "must be finite and at most .*, number 1 is inf"),
     (np.float32([0, 0, np.nan]), "must be finite and at most .*, number 2 is nan"),
 ]
 
@@ -109,7 +110,7 @@ def test_rewards_that_are_refused(given: Any) -> None:
 
 
 def test_rewards_too_large_to_learn_from() -> None:
-    for given in (10**400, 10**5000, np.array([np.nan]), -1e39, 1e20):
+    for given in (10**400, 10**5000, np.float16("inf"), np.array([np.nan]), -1e39, 1e20):
         with pytest.raises(ValueError, match="must be finite and at most"):
             border.reward(given)
 

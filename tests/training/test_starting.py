@@ -130,10 +130,12 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: P
     old = trained(runs)
     file, run = old.directory.policy_file, old.directory.path
     scaled = trained(runs, name="scaled", normalize_observation=True).directory.policy_file
+    normed = trained(runs, name="normed", actor_layer_norm=True).directory.path
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(file.read_bytes()[:-7])
     for source, changes, words in [
         (run, {"hidden": (8, 8)}, "does not fit this run: actor.0.bias is"),
+        (normed, {}, r"does not fit this run: it also has actor\.0\.offset"),
         (run, {"algorithm": "sac"}, "has algorithm=td3, this run sac"),
         (run, {"env": "Hopper-v5"}, "does not fit this run"),
         (run, {"normalize_observation": True}, "has normalize_observation=False, this run True"),

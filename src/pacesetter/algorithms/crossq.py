@@ -29,7 +29,7 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
-from pacesetter.settings.values import Count, Width
+from pacesetter.settings.values import LARGEST_COUNTED, Count, Width
 
 
 def _check_bins(bins: int, info: ValidationInfo) -> int:
@@ -66,7 +66,10 @@ class Hyper(OffPolicy):
     critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
     policy_delay: int = Field(3, ge=1, le=1_000, description="critic updates per actor update")
     renorm_after: Count = Field(
-        100_000, ge=0, description="a network's updates with plain batch norm before renorm"
+        100_000,
+        ge=0,
+        le=LARGEST_COUNTED,
+        description="a network's updates with plain batch norm before renorm",
     )
     weight_norm: bool = Field(
         False, description="keep the weights into every hidden unit at length 1"

@@ -192,10 +192,12 @@ class Expansion(td3.TD3):
         return action, min_q(values.reshape(-1, self.hyper.critics, len(observation)), axis=1)
 
     def routes(self, rows: int) -> Array:
-        """1 where a critic learns from a row, (critics, B); a minibatch has them in any order."""
+        """What a row counts for a critic, (critics, B): the mean over B is that over its own rows,
+        every `critic_members`-th; a minibatch has them in any order.
+        """
         members = jnp.arange(self.hyper.critic_members)
-        own = jnp.arange(rows) % len(members) == members[:, None]
-        return own.repeat(self.hyper.critics, axis=0).astype(jnp.float32)
+        own = (jnp.arange(rows) % len(members) == members[:, None]).astype(jnp.float32)
+        return (own / own.mean(axis=1, keepdims=True)).repeat(self.hyper.critics, axis=0)
 
     def fit_models(self, state: Any, batch: Batch) -> tuple[State, Array]:
         """One Adam step of every model, each on every `models`-th row; their mean loss."""

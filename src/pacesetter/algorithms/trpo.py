@@ -48,12 +48,18 @@ class Hyper(OnPolicy):
     gae_lambda: float = Field(0.95, ge=0, le=1, description="decay of later errors in advantages")
     max_kl: float = Field(0.02, gt=0, description="bound of the mean KL of one update, in nats")
     damping: float = Field(0.01, ge=0, description="added to the Fisher matrix's diagonal")
-    gradient_steps: int = Field(10, ge=1, description="conjugate gradient steps an update")
-    backtracks: int = Field(10, ge=1, description="lengths that the line search tries")
+    gradient_steps: int = Field(
+        10, ge=1, le=1_000, description="conjugate gradient steps an update"
+    )
+    backtracks: int = Field(10, ge=1, le=1_000, description="lengths that the line search tries")
     backtrack_ratio: float = Field(0.8, gt=0, lt=1, description="each length by the one before")
     critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critic")
-    critic_epochs: int = Field(20, ge=0, description="passes of the critic over a rollout")
-    critic_batch_size: int = Field(128, ge=1, description="observations in its minibatches")
+    critic_epochs: int = Field(
+        20, ge=0, le=1_000_000, description="passes of the critic over a rollout"
+    )
+    critic_batch_size: int = Field(
+        128, ge=1, le=1_000_000, description="observations in its minibatches"
+    )
 
 
 class State(NamedTuple):

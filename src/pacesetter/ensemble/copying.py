@@ -1,6 +1,7 @@
 """Members that start again from others: what is copied, and that no two share a buffer."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -30,6 +31,12 @@ def copy_from_parents(
         own if parent == member else _copied(learner, own, states[parent], copy)
         for member, (own, parent) in enumerate(zip(states, parents, strict=True))
     ]
+
+
+def check_copy(learner: Learner, states: Sequence[Any], copy: str) -> None:
+    """Refuse, before anything is trained, a way of copying that a learner does not know."""
+    if copy != "full" and len(states) > 1:
+        jax.eval_shape(partial(_copied, learner, copy=copy), states[0], states[1])
 
 
 def mean_state(states: Sequence[Any], weights: Reals, best: int) -> Any:

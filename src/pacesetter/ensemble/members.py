@@ -13,7 +13,7 @@ from pacesetter import algorithms
 from pacesetter.batch import Spec
 from pacesetter.config import Config
 from pacesetter.ensemble.averages import Averages
-from pacesetter.ensemble.copying import copy_from_parents
+from pacesetter.ensemble.copying import check_copy, copy_from_parents
 from pacesetter.ensemble.experience import Experience
 from pacesetter.ensemble.explorer import Explorer
 from pacesetter.ensemble.loop import Part, numbered
@@ -42,6 +42,7 @@ class Members:
         self.config = config
         self.budget = config.budget
         self.learners = Learners(compiled, run.members, run.seed, run.same_init)
+        check_copy(compiled.learner, self.learners.states, run.copy)
         # Env n of member k has the number n K + k.
         self.explorers = [
             Explorer(
@@ -168,8 +169,10 @@ class Members:
         progress.end_episode(k, total, len(explorer.env.actions))
         self.experience.end_episode(i, total)
         self.selector.end_episode(k, total, explorer.started, member.copied)
-        whole = explorer.started >= max(self.config.hyper.warmup, member.copied)
-        if self.config.hyper.assess and whole:
+        if self.config.hyper.assess and explorer.started >= self.config.hyper.warmup:
+            if explorer.started < member.copied:
+                self.policy_checkpoints.skip_episode(k)
+                return
             updates = member.update_calls * self.updates.per_call
             policy = self.current_policy(k)
             self.policy_checkpoints.end_episode(k, total, updates, policy, progress.step)

@@ -88,6 +88,13 @@ class PolicyCheckpoints:
             about = {"kept_at": step, "worst_return": assessment.best}
             self.kept[k] = replace(policy, about=about)
 
+    def skip_episode(self, k: int) -> None:
+        """End an assessment without a verdict, as a copy came in the middle of an episode.
+
+        Waiting for a whole episode could last for ever where copies come more often than ends.
+        """
+        self.assessments[k].returns, self.assessments[k].over = [], True
+
     def policy(self, k: int) -> Policy | None:
         """The best policy of member k that was kept, if any was."""
         kept = self.kept[k]

@@ -11,6 +11,7 @@ import numpy as np
 from pacesetter.errors import show
 from pacesetter.types import ALLOWED, LARGEST, Floats, Shape
 
+FINITE = np.float64(LARGEST)  # as a Python number it would be infinity beside a float16
 ROUNDING = 1e-6  # of a bound; float32 has seven digits
 
 
@@ -48,7 +49,7 @@ def observation(given: Any, shape: Shape) -> Floats:
         raw = np.asarray(given)
         if raw.dtype.kind not in "bfiuO":
             raise TypeError
-        inside = np.abs(raw) <= LARGEST
+        inside = np.abs(raw) <= FINITE
         fine = np.logical_and.reduce(inside, axis=None)  # `all` without a call of Python
         flat = np.array(raw if fine else 0, np.float32).ravel()
     except Exception:
@@ -64,6 +65,8 @@ def observation(given: Any, shape: Shape) -> Floats:
 def reward(given: Any) -> float:
     """One number that is not too large to learn from, which may come as an array of one."""
     number = given if isinstance(given, (int, float, np.floating)) else _single("reward", given)
+    if isinstance(number, np.floating):
+        number = float(number)
     if not abs(number) <= LARGEST:
         raise ValueError(f"reward: must be {ALLOWED}, got {show(given)}")
     return float(number)

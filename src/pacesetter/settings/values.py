@@ -85,6 +85,7 @@ class Tune(NamedTuple):
 
 
 Width = Annotated[int, Field(ge=1, le=16_384)]
+LARGEST_COUNTED = 2**31 - 1  # what a learner's program compares with one of its counters
 Count = Annotated[int, BeforeValidator(_count)]
 Numbers = Annotated[str, AfterValidator(_numbers)]
 Duration = Annotated[float, BeforeValidator(_duration)]

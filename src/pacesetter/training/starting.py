@@ -10,7 +10,7 @@ from pacesetter import policy, storage
 from pacesetter.config import Config
 from pacesetter.ensemble.loop import Loop
 from pacesetter.errors import UsageError
-from pacesetter.learner.tree_arrays import below, rebuild
+from pacesetter.learner.tree_arrays import below, flatten, rebuild
 from pacesetter.runs import find
 
 
@@ -79,5 +79,11 @@ def _from_policy(loop: Loop, config: Config, file: Path) -> None:
 
 
 def _copied(like: Any, arrays: storage.Arrays) -> Any:
-    """A state of its own, since an update uses it up."""
+    """A state of its own, since an update uses it up; a ValueError names what it has no place for.
+
+    Such as the gains of layer norm, without which the other weights would be another network.
+    """
+    extra = sorted(arrays.keys() - flatten(like).keys() - {"exploration"})
+    if extra:  # a noise that this run does not have is no part of the networks
+        raise ValueError(f"it also has {extra[0]}")
     return jax.tree.map(jnp.array, rebuild(like, arrays))

@@ -146,7 +146,8 @@ def selections(comparison: Comparison) -> list[Table]:
     headers += ["founder", "line of the champion"]
     notes = [
         "Gap: the best member's mean return less the next one's, over the standard error of such a "
-        "gap. Coin flips: selections with a gap below one standard error.",
+        "gap. Coin flips: selections with a gap below one standard error. Where one episode per "
+        "member decides, the error is their own spread, so most gaps of two members are below it.",
         "Founder: the member all descend from, and the selection since when. Line: the places "
         "through which the final champion descends, from the first selection to the last.",
     ]
