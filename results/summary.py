@@ -13,10 +13,11 @@ import argparse
 import json
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pacesetter.runs import find_all
+from pacesetter.runs import RunDirectory, find_all
 from pacesetter.storage import as_json
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.groups import Comparison
@@ -51,7 +52,11 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "walkers": [{"budget": "30k"}],
     "champions": [{"budget": "100k", "reference": "crossq-small"}],
     "humanoid": [{"budget": "776k", "reference": "multi-td3"}],
+    "ensemble": [{"reference": "single"}, {"reference": "single-200k"}, {"reference": "none"}],
+    "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
 }
+
+APART = ("ensemble", "vary")  # studies of which every policy that was evaluated counts apart
 
 
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
@@ -64,11 +69,32 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
         run = read(str(each.path), line)
         if run is None or not (run.finished or unfinished):
             print(f"left out as unfinished: {each.path}", file=sys.stderr)
-        elif new.setdefault(_key(line), line) is not line:
-            sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
+            continue
+        for one in [line, *(apart(each, line) if study in APART else ())]:
+            if new.setdefault(_key(one), one) is not one:
+                sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
     table = {_key(line): line for line in old} | new
     lines = [as_json(table[key], separators=(",", ":")) for key in sorted(table)]
     file.write_text("".join(line + "\n" for line in lines))
+
+
+def apart(run: RunDirectory, line: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Lines of the run's other policies, as if each were a run: `none-members` has the mean returns
+    of the members alone, `none-mean` those of their mean action, `none-ema` of their EMA actors'.
+    """
+    rows, place = run.rows("eval"), line["columns"].index("returns")
+    found = {"members": [row.get("members") for row in rows]}
+    for name, key in (("mean", "members"), ("ema", "ema")):
+        means = [row.get("mean_actions", {}).get(key) for row in rows]
+        found[name] = [each and each["returns"] for each in means]
+    for name, returns in found.items():
+        if all(returns):
+            changed = [
+                [*values[:place], list(each), *values[place + 1 :]]
+                for values, each in zip(line["evaluations"], returns, strict=True)
+            ]
+            settings = line["settings"] | {"name": f"{line['settings']['name']}-{name}"}
+            yield line | {"settings": settings, "evaluations": changed, "selections": []}
 
 
 def _key(line: dict[str, Any]) -> tuple[str, ...]:
@@ -81,6 +107,8 @@ def shown(study: str, limit: dict[str, str]) -> str:
     """The tables of a study at one place."""
     there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
     found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
+    if study in APART:
+        found += contrasts.together(there)
     found += [*contrasts.best_of_two(there), contents.ledger(there.groups)]
     if study == "frontier":
         found.append(levels(there))

@@ -26,6 +26,7 @@ from pacesetter.cli.main import main
 from pacesetter.config import Config, Run, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
+from pacesetter.settings.budget import steps_per_count
 from pacesetter.study.bench import queue as bench_module
 from pacesetter.study.bench import suite
 from pacesetter.study.bench.executors import Local, run_command
@@ -915,15 +916,24 @@ def test_ray_cluster(jobs: list[Job]) -> None:
 
 
 def test_arms_of_the_ensemble_suite_spend_what_it_says() -> None:
-    """A learner of any arm makes 95k updates in 100k own steps, or twice both in `single-200k`."""
-    file = Path(__file__).parents[2] / "results" / "ensemble.toml"
-    for job in expand(load(str(file)), {}, "runs"):
-        run, hyper = job.config
-        steps = job.config.budget / run.members
-        updates = (job.config.budget - hyper.warmup) / run.members * hyper.updates_per_step
-        times = 2 if run.name == "single-200k" else 1
-        assert (steps, updates) == (times * 100_000, times * 95_000), run.name
-        assert (run.members, run.wait) in {(1, True), (2, False)}
+    """A learner of any arm makes 95k updates on 100k steps of its own, but for two controls."""
+    spent: dict[str, tuple[int, float]] = {}
+    for file in ("ensemble.toml", "vary.toml"):
+        for job in expand(load(str(Path(__file__).parents[2] / "results" / file)), {}, "runs"):
+            run, hyper = job.config
+            updates = (job.config.budget - hyper.warmup) / run.members * hyper.updates_per_step
+            spent[run.name] = (job.config.budget, updates)
+            assert (run.members > 1) != run.wait
+            assert (run.members > 1 or "single" in run.name) == (run.mean_actions == "on")
+            evaluations = job.config.budget // (
+                run.eval_every * steps_per_count(job.config.settings())
+            )
+            assert (evaluations, run.eval_episodes) == (10, 10)
+    assert spent.pop("single-200k") == (200_000, 190_000)
+    assert spent.pop("single-2-envs") == (200_000, 95_000)
+    for name, found in spent.items():
+        times = 4 if name.startswith("vary") else 1 if name.startswith(("single", "gamma")) else 2
+        assert found == (times * 100_000, 95_000), name
 
 
 LEAVES = """#!/bin/sh

@@ -16,7 +16,7 @@ import pytest
 from compare import make_run
 from matplotlib.figure import Figure
 from scripted_runs import IDLE, start
-from short_runs import run_to_end
+from short_runs import TINY, run_to_end
 
 from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
@@ -28,6 +28,7 @@ from pacesetter.study.compare.groups import split
 from pacesetter.study.compare.results import compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
+from pacesetter.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]
 
@@ -785,3 +786,28 @@ def test_results_are_collected_once_and_finished(tmp_path: Path) -> None:
 
 def _lines(script: Path) -> list[str]:
     return script.with_name("pilot.jsonl").read_text().splitlines()
+
+
+def test_other_policies_of_a_run_are_collected_as_groups(tmp_path: Path) -> None:
+    """Of a study of ensembles: members alone, their mean action and that of their EMA actors."""
+    settings: dict[str, Any] = {**TINY, "steps": 200, "eval_every": 100, "members": 2}
+    settings |= {"rule": "none", "mean_actions": "on"}
+    trainer = Trainer("td3", "Pendulum-v1", runs=tmp_path / "runs", name="none", **settings)
+    run_to_end(trainer)
+    rows = trainer.directory.rows("eval")
+    assert all(row["members"][row["champion"]] == row["mean"] for row in rows)
+    (tmp_path / "results").mkdir()
+    copy = tmp_path / "results" / "summary.py"
+    copy.write_text((ROOT / "results" / "summary.py").read_text())
+    command = [sys.executable, copy, "--study", "ensemble", "--collect", "ensemble", "runs"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "none-ema" in done.stdout
+    runs = gather([copy.with_name("ensemble.jsonl")]).runs
+    found = {run.name: run.returns for run in runs}
+    assert found.keys() == {"none", "none-members", "none-mean", "none-ema"}
+    for name, means in {
+        "none-members": [np.mean(row["members"]) for row in rows],
+        "none-mean": [row["mean_actions"]["members"]["mean"] for row in rows],
+        "none-ema": [row["mean_actions"]["ema"]["mean"] for row in rows],
+    }.items():
+        np.testing.assert_allclose(found[name], means, atol=1e-3)

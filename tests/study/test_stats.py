@@ -93,6 +93,9 @@ def test_few_seeds_get_no_bootstrap_interval() -> None:
     for tasks in ([ten], [ten, ten]):
         assert not math.isnan(stats.iqm(tasks).low)
     assert math.isnan(stats.improvement([(nine, nine)]).low)
+    three, far = np.arange(3.0), np.arange(3.0) + 1.5
+    assert math.isnan(stats.improvement([(three, far)] * 3).low), "nine runs a side"
+    assert not math.isnan(stats.improvement([(three, far)] * 4).low), "twelve, over four tasks"
     assert np.isnan(stats.profile([nine], nine)[1]).all()
     found = stats.iqm([ten])
     assert found.low < found.value < found.high

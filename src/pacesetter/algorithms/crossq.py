@@ -29,7 +29,7 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
-from pacesetter.settings.values import LARGEST_COUNTED, Count, Width
+from pacesetter.settings.values import LARGEST_COUNTED, Count, LearningRate, Warmup, Width
 
 
 def _check_bins(bins: int, info: ValidationInfo) -> int:
@@ -46,15 +46,17 @@ def _check_bins(bins: int, info: ValidationInfo) -> int:
 class Hyper(OffPolicy):
     """Defaults are the paper's; `crossq-small` has critics as narrow as the actor."""
 
-    warmup: Count = Field(5_000, ge=0, description="first steps of all members, uniform actions")
+    warmup: Warmup = Field(5_000, ge=0, description="first steps of all members, uniform actions")
     hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of the actor's hidden layers"
     )
     critic_hidden: tuple[Width, ...] = Field(
         (2048, 2048), min_length=1, description="widths of the critics' hidden layers"
     )
-    actor_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the actor")
-    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
+    actor_learning_rate: LearningRate = Field(1e-3, gt=0, description="Adam step size of the actor")
+    critic_learning_rate: LearningRate = Field(
+        1e-3, gt=0, description="Adam step size of the critics"
+    )
     alpha_learning_rate: float = Field(
         1e-3, gt=0, description="Adam step size of the log temperature"
     )

@@ -86,7 +86,7 @@ class Ensemble:
     mean_actions: Literal["auto", "on", "off"] = Field(
         "auto",
         description="also evaluate the mean action of all members, and that of their EMA actors; "
-        "auto: with several members",
+        "auto: with several members; on: each member alone too",
     )
     ema_tau: float = Field(0.005, gt=0, le=1, description="step of the EMA actors per actor update")
     snapshots: int = Field(

@@ -57,9 +57,8 @@ class Evaluator:
         if run.vary:
             scales = [member.scales for member in progress.members]
             values["settings"] = shown(run, self.config.hyper, scales)
-        if ending and run.rule == "none" and run.members > 1:
-            members = range(run.members)
-            values["members"] = [self._trial(self.policy(k).act, k).mean for k in members]
+        if run.members > 1 and (run.mean_actions == "on" or (ending and run.rule == "none")):
+            values["members"] = self._each_member(trial)
         self._save(policy, trial)
         self.loop.keep_snapshot(policy)
         return values
@@ -96,6 +95,14 @@ class Evaluator:
             trial = self._trial(mean_action(policies), self.loop.progress.champion)
             found[name] = {"mean": trial.mean, "std": trial.std, "returns": trial.returns}
         return found
+
+    def _each_member(self, champions: Evaluation) -> list[float]:
+        """Mean return of every member on the same starts; the champion has had its trial."""
+        champion = self.loop.progress.champion
+        return [
+            champions.mean if k == champion else self._trial(self.policy(k).act, k).mean
+            for k in range(self.config.run.members)
+        ]
 
     def _trial(self, act: Act, member: int) -> Evaluation:
         run = self.config.run

@@ -163,8 +163,8 @@ def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
     """Probability that a run of x beats one of y on a task, ties counting half, mean over tasks.
 
     With one task this is the Mann-Whitney U statistic over n m. NaN from fewer than three runs a
-    side. The interval is a percentile bootstrap from ten seeds on; where every pair has the same
-    outcome, resampling says nothing.
+    side. The interval is a percentile bootstrap from ten runs a side on, over all tasks; where
+    every pair has the same outcome, resampling says nothing.
     """
     sides = [side for pair in pairs for side in pair]
     if min(map(len, sides)) < FEWEST_CHANCES or not np.isfinite(np.concatenate(sides)).all():
@@ -178,7 +178,7 @@ def improvement(pairs: Sequence[tuple[Array, Array]]) -> Interval:
         alike = alike and np.ptp(wins) == 0
         drawn = (_weights(rng, len(x), RESAMPLES) @ wins) * _weights(rng, len(y), RESAMPLES)
         draws += drawn.sum(axis=1) / len(pairs)
-    few = min(map(len, sides)) < BOOTSTRAP_SEEDS
+    few = min(sum(map(len, side)) for side in zip(*pairs, strict=True)) < BOOTSTRAP_SEEDS
     return Interval(value) if few or alike else Interval(value, *_percentiles(draws))
 
 
