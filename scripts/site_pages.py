@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -25,6 +26,16 @@ NOUNS = ("algorithms", "presets", "rules", "suites")
 LINK = re.compile(r"\]\(((?:\.\./)+)([\w./-]+)\)")
 LANGUAGES = {".py": "python", ".toml": "toml", ".ipynb": "json", ".jsonl": "json"}
 MODULES = re.compile(r"\b(?:[a-z_]+\.)+(?=[A-Z])")  # before the names of classes
+ELSEWHERE = (  # public too, each imported from its own module
+    "pacesetter.media.record.record",
+    "pacesetter.media.poster.poster",
+    "pacesetter.media.watch.watch",
+    "pacesetter.media.export.export",
+    "pacesetter.media.sb3.SB3Policy",
+    "pacesetter.media.hub.push",
+    "pacesetter.media.hub.load_from_hub",
+    "pacesetter.tracking.tracked",
+)
 NO_SEARCH = "---\nsearch: { exclude: true }\n---\n\n"
 
 
@@ -146,8 +157,14 @@ def python() -> str:
     given = {kind.__name__: kind for thing in public.values() for kind in gives(thing)}
     rest = {name: kind for name, kind in given.items() if kind not in public.values()}
     line = f"`from pacesetter import {', '.join(public)}`"
-    start = f"# Python\n\n{line}\n\nBelow them are the classes that they give.\n"
-    return start + "".join(entry(name, thing) for name, thing in (public | rest).items())
+    below = "Below them are the classes that they give, and what other modules have."
+    start = f"# Python\n\n{line}\n\n{below}\n"
+    parts = [entry(name, thing) for name, thing in (public | rest).items()]
+    for place in ELSEWHERE:
+        module, name = place.rsplit(".", 1)
+        text = entry(name, getattr(import_module(module), name))
+        parts.append(text.replace("\n\n", f"\n\n`from {module} import {name}`\n\n", 1))
+    return start + "".join(parts)
 
 
 def gives(thing: Any) -> list[type]:
