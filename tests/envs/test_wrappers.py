@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from broken_envs import Probe
+from gymnasium.spaces import Box, Dict
 from short_runs import TINY, assert_same, log, run_to_end, run_to_step
 
 from pacesetter.cli.main import main
 from pacesetter.envs import Environment, Recipe
+from pacesetter.envs.spaces import refuse_images
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
@@ -43,10 +45,31 @@ def test_a_dict_is_flattened_and_said(rng: np.random.Generator) -> None:
 
 def test_what_was_flattened_is_not_flattened_for_an_image() -> None:
     """Unless a wrapper is asked for, which is then the user's own choice."""
-    with pytest.raises(UsageError, match="image of 8x8x3 bytes"):
+    with pytest.raises(UsageError, match="image of 8x8x3 uint8"):
         world("Image")
     flat = world("Image", "gymnasium.wrappers:FlattenObservation")
     assert flat.observation_size == 192
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "is_image"),
+    [
+        ((84, 84, 3), np.float32, True),
+        ((4, 84, 84), np.float32, True),
+        ((64, 64), np.uint8, True),
+        ((8, 8, 3), np.uint8, True),
+        ((20, 3, 3), np.float32, False),  # rotations of twenty joints
+        ((64, 64), np.float32, False),  # a matrix
+        ((200,), np.uint8, False),
+    ],
+)
+def test_what_is_taken_for_an_image(shape: tuple[int, ...], kind: Any, is_image: bool) -> None:
+    space = Box(0, 1, shape, kind)
+    if not is_image:
+        refuse_images("X", space)
+        return
+    with pytest.raises(UsageError, match="is an image of"):
+        refuse_images("X", Dict(camera=space))
 
 
 def test_wrappers_are_applied_in_order() -> None:

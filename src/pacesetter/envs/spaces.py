@@ -10,6 +10,7 @@ from pacesetter.envs.calls import call
 from pacesetter.errors import TaskError, UsageError, show
 from pacesetter.types import Floats
 
+IMAGE_SIDE = 16  # pixels of height and width from which numbers are taken for an image
 WRAP = "--wrap module:Class"
 WAYS_OUT = {
     "observation": f"give a wrapper that makes a Box of it, such as {WRAP}",
@@ -30,12 +31,20 @@ def refuse_images(name: str, space: Any) -> None:
     inside: Any = space.spaces if isinstance(space, (Dict, Tuple)) else ()
     for part in inside.values() if isinstance(inside, dict) else inside:
         refuse_images(name, part)
-    if isinstance(space, Box) and space.dtype == np.uint8 and len(space.shape) >= 3:
+    if isinstance(space, Box) and _is_image(space):
         size = "x".join(map(str, space.shape))
         raise UsageError(
-            f"env: {name}: observation space: is an image of {size} bytes, and no algorithm here "
-            f"has layers that see; train on numbers, or {WAYS_OUT['observation']}"
+            f"env: {name}: observation space: is an image of {size} {space.dtype}, and no "
+            f"algorithm here has layers that see; train on numbers, or {WAYS_OUT['observation']}"
         )
+
+
+def _is_image(space: Box) -> bool:
+    """Bytes in colour, or anything with height and width, grey ones as bytes."""
+    sides = sum(side >= IMAGE_SIDE for side in space.shape)
+    if space.dtype == np.uint8:
+        return len(space.shape) >= 3 or sides >= 2
+    return len(space.shape) >= 3 and sides >= 2
 
 
 def check_spaces(name: str, env: gymnasium.Env[Any, Any]) -> None:
