@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.runs import find_all
-from pacesetter.storage import as_json
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import Run, compact, read
@@ -57,7 +56,8 @@ STUDIES: dict[str, list[dict[str, str]]] = {
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
     """Take finished runs in, one line each; a line of the same task, name and seed gives way."""
     file = HERE / f"{study}.jsonl"
-    old = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    before = file.read_text("utf-8").splitlines() if file.exists() else []
+    old = [json.loads(line) for line in before]
     new: dict[tuple[str, ...], dict[str, Any]] = {}
     for each in (run for folder in folders for run in find_all(folder)):
         line = compact(each)
@@ -67,8 +67,8 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
         elif new.setdefault(_key(line), line) is not line:
             sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
     table = {_key(line): line for line in old} | new
-    lines = [as_json(table[key], separators=(",", ":")) for key in sorted(table)]
-    file.write_text("".join(line + "\n" for line in lines))
+    lines = [json.dumps(table[key], separators=(",", ":")) for key in sorted(table)]
+    file.write_text("".join(line + "\n" for line in lines), "utf-8")
 
 
 def _key(line: dict[str, Any]) -> tuple[str, ...]:

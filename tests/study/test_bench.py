@@ -970,3 +970,10 @@ def test_a_keyword_of_none_stays_none(capsys: pytest.CaptureFixture[str]) -> Non
     line = capsys.readouterr().out
     assert "--env.render_mode=none" in line
     assert "null" not in line
+
+
+@pytest.mark.parametrize("value", [float("inf"), [0.5, float("-inf")], {"a": None}, "a 🦿", 1e-9])
+def test_a_keyword_is_the_same_in_a_runs_command(value: Any) -> None:
+    flags = {"envs": ["Pendulum-v1"], "env_kwargs": {"key": value}}
+    (job,) = expand(suite.of_algorithms(["td3"]), flags, "runs")
+    assert parsed(job.words).run.env_kwargs == {"key": value}

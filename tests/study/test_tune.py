@@ -147,6 +147,11 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     assert (settings["steps"], settings["seed"], settings["hidden"]) == (200, 0, [16, 16])
 
 
+def test_values_of_the_best_settings_are_toml() -> None:
+    given = {"a 🦿": [0.5, float("inf")], "b": {"c": True, "d": 1e-9}, "e": float("-inf")}
+    assert tomllib.loads(f"x = {tune._toml(given)}")["x"] == given
+
+
 def test_report_seeds_are_never_tuning_seeds() -> None:
     """Those of trials start where those that `bench` takes end."""
     tuning = study(trials=2)

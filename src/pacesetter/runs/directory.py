@@ -26,7 +26,6 @@ from pacesetter.runs.log import Log, Row
 from pacesetter.runs.provenance import provenance
 from pacesetter.runs.records import SCHEMA, check_record
 from pacesetter.settings.validation import difference
-from pacesetter.storage import as_json
 
 CONFIG = "config.json"
 # Settings in which the seeds of one name may differ.
@@ -166,7 +165,9 @@ class RunDirectory:
             last.rmdir()
 
     def _write_config(self, table: Row) -> None:
-        write_atomically(self.config_file, (as_json(table, indent=1) + "\n").encode())
+        # With Infinity, which other readers may not take: a task's keyword may be infinite, and
+        # with null in its place the run would be another.
+        write_atomically(self.config_file, (json.dumps(table, indent=1) + "\n").encode())
 
     def record(self) -> Row:
         """The whole config.json."""

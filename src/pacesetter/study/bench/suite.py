@@ -179,7 +179,9 @@ def _flags(settings: Settings) -> Iterable[str]:
 
 def _keyword(value: Any) -> str:
     """A keyword of an env as `--env.KEY` reads it."""
-    return "none" if value is None else json.dumps(value)
+    if value is None:
+        return "none"
+    return repr(value) if isinstance(value, float) else json.dumps(value)  # inf, not Infinity
 
 
 def _envs(value: Any) -> list[str]:
