@@ -136,10 +136,15 @@ class Run:
         return float(learned.max()) if learned.size else np.nan
 
     @property
+    def has_learned(self) -> bool:
+        """Whether an evaluation is of a policy that has been updated."""
+        return bool((self.updates > 0).any())
+
+    @property
     def counted(self) -> NDArray[np.bool_]:
         """Which evaluations (N,) count for the final return."""
         learned = self.updates > 0
-        return learned if learned.any() else np.ones_like(learned)
+        return learned if self.has_learned else np.ones_like(learned)
 
     @property
     def makers(self) -> list[Row]:
