@@ -210,6 +210,15 @@ def test_several_budgets_are_refused_unless_cut_or_mixed(tmp_path: Path) -> None
     assert [run.updates[-1] for run in cut.runs] == [0, 0]  # a cut run's ledger is cut too
 
 
+def test_one_budget_for_runs_that_evaluate_at_other_steps(tmp_path: Path) -> None:
+    """None of them has an evaluation at the budget, and a smaller one would not help either."""
+    make_run(tmp_path, "Ant-v5", "td3", budget=120_000, evaluations=24)
+    make_run(tmp_path, "Ant-v5", "sac", budget=120_000, evaluations=40)
+    found = compare([tmp_path], budget="100k")
+    assert [run.clock[-1] for run in found.runs] == [99_000, 100_000]
+    assert any("(eval_every)" in note for note in found.notes)
+
+
 def test_equal_cpu_time_cuts_each_run_where_it_stood(tmp_path: Path) -> None:
     """Runs of other lengths need no --mixed then; one that never spent so much is left out."""
     small(tmp_path, seed=0)

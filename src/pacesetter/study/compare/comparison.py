@@ -134,7 +134,8 @@ def _mixtures(runs: list[Run], mixed: bool, limit: Limit) -> list[str]:
         if len(several) > 1:
             faults.append(f"env: {task} in the versions {', '.join(sorted(several))}")
     budgets = sorted({run.budget for run in runs})
-    if len(budgets) > 1 and not limit.cpu:
+    # A limit leaves only what reached it, and then the last evaluations up to it may lie apart.
+    if len(budgets) > 1 and not (limit.budget or limit.cpu):
         shown = ", ".join(f"{budget:,}" for budget in budgets)
         faults.append(
             f"budget: runs of {shown} env steps; --budget {budgets[0]} takes each up to it"
