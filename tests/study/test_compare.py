@@ -30,6 +30,7 @@ from pacesetter.study.report import contents, contrasts, curves, output, paper, 
 from pacesetter.study.report.published import sources
 
 ROOT = Path(__file__).parents[2]
+SELECTED = [5, 0.0, 1.0, [0], 0]
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +104,7 @@ def test_what_is_not_found_is_one_line(runs: Path, word: str, said: str, tmp_pat
         ({"varied": [{"gamma": [0.9]}, {"gamma": [0.9]}]}, "varied: must have a row"),
         ({"varied": [{"gamma": [0.9, 0.8]}]}, "1 values of each setting"),
         ({"varied": [{"gamma": "high"}]}, "varied.0.gamma"),
+        ({"selections": [SELECTED], "varied": [{"tau": [1]}, {"x": [1]}]}, "varied: must name"),
         ({"resumed": [{"versions": 3}]}, "resumed.0.versions"),
         ({"settings": {}}, "is missing"),
     ],
@@ -118,6 +120,13 @@ def test_a_foreign_line_is_refused(
     assert re.search(said, why)
     with pytest.raises(UsageError, match=f"none can be read: .*{said}"):
         compare([file])
+
+
+@pytest.mark.parametrize("odd", [{"lr_horizon": "20k"}, {"replay_horizon": [1]}, {"rule": []}])
+def test_an_odd_setting_is_refused(tmp_path: Path, odd: dict[str, Any]) -> None:
+    run = small(tmp_path, select_window=None, **odd)
+    with pytest.raises(UsageError, match=f"settings.{next(iter(odd))}: should be"):
+        compare([run], budget=10_000)
 
 
 def test_a_line_without_one_of_its_keys_is_read_or_refused(runs: Path, tmp_path: Path) -> None:

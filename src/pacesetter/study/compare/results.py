@@ -231,6 +231,8 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         varied: list[Any] = table.get("varied", [])
         if varied and len(varied) != len(rows) + 1:
             raise ValueError("varied: must have a row at the start and one per selection")
+        if any(row.keys() != varied[0].keys() for row in varied):
+            raise ValueError("varied: must name the same settings in each row")
         if any(len(each) != members for row in varied for each in row.values()):
             raise ValueError(f"varied: must have {members} values of each setting")
     except (ValueError, TypeError, LookupError) as error:
