@@ -255,6 +255,13 @@ def test_uncounted_selection_steps_are_told(tmp_path: Path) -> None:
     assert any("Steps of selection come on top" in note for note in compare([tmp_path]).notes)
 
 
+def test_a_version_is_of_the_task_and_not_of_its_keywords() -> None:
+    assert split("Walker2d-v5") == ("Walker2d", "v5")
+    kept = "xml_file=robot-v1.xml"
+    assert split(f"Walker2d-v5 {kept}") == (f"Walker2d {kept}", "v5")
+    assert split(f"mine:Robot {kept}") == (f"mine:Robot {kept}", "-")
+
+
 def test_the_paper_suites_ant_stands_in_the_papers_tables(tmp_path: Path) -> None:
     make_run(tmp_path, "pacesetter/Ant111-v4", "multi-td3", budget=20_000, evaluations=10)
     text = tables.plain(paper.tables(compare([tmp_path])))
