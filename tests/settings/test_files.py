@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import pacesetter
+from pacesetter.errors import UsageError
 from pacesetter.settings.files import read_file
 
 READ = "import sys; from pacesetter.settings.files import *; print(read_file(Path(sys.argv[1])))"
@@ -20,6 +21,12 @@ UNNAMED = re.compile(r'read_text\(\)|write_text\([^,\n]*\)$|\.open\(("[arwx]\+?"
 def test_a_byte_order_mark_is_no_text(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert read_file(tmp_path / name) == {"name": "a"}
+
+
+def test_a_name_that_is_no_word_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"settings": {"name": []}}')
+    with pytest.raises(UsageError, match="they cannot be those of td3"):
+        read_file(tmp_path / "a.json", "td3")
 
 
 def test_the_locale_decides_nothing(tmp_path: Path) -> None:
