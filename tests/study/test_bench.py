@@ -977,3 +977,13 @@ def test_a_keyword_is_the_same_in_a_runs_command(value: Any) -> None:
     flags = {"envs": ["Pendulum-v1"], "env_kwargs": {"key": value}}
     (job,) = expand(suite.of_algorithms(["td3"]), flags, "runs")
     assert parsed(job.words).run.env_kwargs == {"key": value}
+
+
+def test_an_algorithm_of_the_current_folder(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (here / "mine_of_bench.py").write_text("from pacesetter.algorithms.td3 import TD3 as Learner")
+    words = ["bench", "--algos", "mine_of_bench:Learner", "--envs", "Pendulum-v1", "--seeds", "1"]
+    assert main([*words, "--print", "commands"]) == 0
+    assert "train mine_of_bench:Learner Pendulum-v1" in capsys.readouterr().out

@@ -5,7 +5,7 @@ import shlex
 import sys
 from typing import Any
 
-from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
+from pacesetter.cli.flags import Parser, add_settings, look_here, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
 from pacesetter.config import Run, preset_layers
 from pacesetter.errors import UsageError
@@ -41,6 +41,7 @@ def _parse(words: list[str]) -> tuple[Suite, Settings, dict[str, Any]]:
     suite = _suite(name, first.algos) if name or first.algos else None
     if suite is not None:
         named = [*first.allow, *(first.algos or [])]
+        look_here(*named)  # their settings are flags, which `parse` needs already
         suite = suite._replace(allow=named)
         suites.require_named(suite, named, vars(first).get("envs", []))
         _add_settings_of(suite, command)
