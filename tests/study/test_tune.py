@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -145,6 +146,16 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     settings = find("td3/0").settings()
     assert {key: settings[key] for key in best.params} == best.params
     assert (settings["steps"], settings["seed"], settings["hidden"]) == (200, 0, [16, 16])
+
+
+def test_the_command_of_the_best_settings_can_be_typed() -> None:
+    """A file whose name has a space, and wrappers, which `train` takes from its own words alone."""
+    tuning = study(1, file="my study.log", wrap=("odd_envs:Doubled",))
+    tuning.run(silent)
+    line, *_ = tuning.best_file.read_text().splitlines()
+    words = ["train", "td3", PROBE, "--config", "my study.best.toml", "--wrap", "odd_envs:Doubled"]
+    assert shlex.split(line) == ["#", "pacesetter", *words]
+    assert main([*words, "--steps", "20", "-q"]) == 0
 
 
 def test_values_of_the_best_settings_are_toml() -> None:

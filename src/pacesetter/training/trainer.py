@@ -60,7 +60,7 @@ class Trainer:
         """
         layers = [read_file(Path(config), algorithm)] if config else []
         if layers and "wrap" not in settings:
-            require_all("wrap", layers[0].get("wrap", ()))
+            require_all("wrap", layers[0].get("wrap", ()), flag="--wrap")
         self.config = resolve(algorithm, name_of(env), *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)

@@ -5,6 +5,7 @@ resumes its trial from the checkpoint, so no heartbeat is needed.
 """
 
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -30,6 +31,7 @@ from pacesetter.study.tune.journal import (
     ranges,
     refuse_foreign,
 )
+from pacesetter.text import printable
 from pacesetter.training.trainer import Report, Trainer
 
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
@@ -207,9 +209,11 @@ class Tuning:
 
     def _best_toml(self, best: optuna.trial.FrozenTrial) -> str:
         run = self.config.run
+        words = ["train", self.algorithm, run.env, "--config", str(self.best_file)]
+        words += ["--wrap", *run.wrap] if run.wrap else []  # which a file alone may not name
         given = {k: self.config.settings()[k] for k in self.fixed if k not in ("steps", "time")}
         lines = [
-            f"# pacesetter train {self.algorithm} {run.env} --config {self.best_file}",
+            f"# pacesetter {printable(shlex.join(words))}",
             f"# Return {best.value:.1f} at {run.steps:,} steps in trial {best.number}, with seed "
             f"{TUNING_SEEDS + best.number}: the best of",
             "# many, so biased upwards; only runs with other seeds tell what these settings give.",
