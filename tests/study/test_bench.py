@@ -987,3 +987,17 @@ def test_an_algorithm_of_the_current_folder(
     words = ["bench", "--algos", "mine_of_bench:Learner", "--envs", "Pendulum-v1", "--seeds", "1"]
     assert main([*words, "--print", "commands"]) == 0
     assert "train mine_of_bench:Learner Pendulum-v1" in capsys.readouterr().out
+
+
+def test_keywords_are_merged_one_by_one(here: Path) -> None:
+    """Of the suite, its file, the entry, its table for the task, and the flags."""
+    (here / "mine.toml").write_text("env_kwargs = {a = 2, b = 2, c = 2, d = 2}")
+    (here / "suite.toml").write_text(
+        'envs = ["Pendulum-v1"]\nenv_kwargs = {e = 1, a = 1}\n[entries.td3]\n'
+        'config = "mine.toml"\nenv_kwargs = {b = 3, c = 3, d = 3}\n'
+        '[entries.td3.env."Pendulum-*"]\nenv_kwargs = {c = 4, d = 4}\n'
+    )
+    (job,) = expand(load("suite.toml"), {"env_kwargs": {"d": 5}}, "runs")
+    assert job.config.run.env_kwargs == {"e": 1, "a": 2, "b": 3, "c": 4, "d": 5}
+    one = resolve("td3", "Pendulum-v1", {"env_kwargs": {"a": 1, "b": 1}}, {"env_kwargs": {"b": 2}})
+    assert one.run.env_kwargs == {"a": 1, "b": 2}
