@@ -534,6 +534,19 @@ def test_run_of_other_settings_is_refused(
     assert [found.path for found in find_all("runs")] == [jobs[1].directory.path]
 
 
+def test_settings_without_a_result_stop_no_study(jobs: list[Job]) -> None:
+    """A run that goes on takes those of them that `resume` takes."""
+    run(jobs[1:], Here())
+    flags = {"env_timeout": "30s", "checkpoint_every": 9.0, "device": "cpu"}
+    again = expand(load("suite.toml"), flags, "runs")
+    work = Bench(again)
+    assert (work.before, work.failed) == (1, {})
+    words = bench_module.words_of(again[1])
+    assert words[0] == "resume"
+    assert {"--env-timeout=30s", "--checkpoint-every=9.0"} < {*words}
+    assert not any("device" in word for word in words)
+
+
 def test_stop_waits_for_all_and_starts_none(jobs: list[Job]) -> None:
     work = Bench(jobs)
     executor = Here(lambda words: work.stop() or stop_at(200)(words))

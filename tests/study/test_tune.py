@@ -329,6 +329,14 @@ def test_nothing_left_to_search() -> None:
         study(**given)
 
 
+def test_settings_without_a_score_are_no_other_study() -> None:
+    study()
+    again = study(env_timeout="30s", checkpoint_every=9.0, device="cpu")
+    assert again.config.run.env_timeout == 30
+    with pytest.raises(UsageError, match=r"range of gamma=\[0.97, 0.999, False\], not None"):
+        study(gamma=0.99)
+
+
 def test_study_of_something_else_is_refused() -> None:
     study()
     for other, said in {("td3", "gamma"): "gamma", ("sac", "gamma"): "algorithm"}.items():

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from pacesetter.config import Config, full_id, merge, resolve
 from pacesetter.consent import require, require_all
 from pacesetter.errors import UsageError, unknown
-from pacesetter.runs import RunDirectory
+from pacesetter.runs import ON_RESUME, RunDirectory
 from pacesetter.settings import Settings
 from pacesetter.settings.files import read_file
 
@@ -124,7 +124,8 @@ def expand(
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
-    jobs = [job._replace(always=always) for job in jobs]
+    again = {key: flags[key] for key in sorted(ON_RESUME & flags.keys())}
+    jobs = [job._replace(always=(*always, *_flags(again))) for job in jobs]
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 

@@ -19,7 +19,7 @@ from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.files import make_folder, present, sync_folder, write_atomically
-from pacesetter.runs import Row, RunDirectory, find_all
+from pacesetter.runs import ON_RESUME, Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
 from pacesetter.study.bench.suite import TUNING_SEEDS
@@ -187,7 +187,8 @@ class Tuning:
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
             allow = [self.algorithm, self.env, *config.run.wrap]
-            trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow)
+            now = {key: given[key] for key in ON_RESUME & given.keys()}
+            trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow, **now)
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
