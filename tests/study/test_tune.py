@@ -22,9 +22,10 @@ from pacesetter.cli.progress import console
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import RunDirectory, find, find_all
+from pacesetter.settings.values import Tune
 from pacesetter.study.bench.suite import TUNING_SEEDS, expand, of_algorithms
 from pacesetter.study.tune import search as tune
-from pacesetter.study.tune.journal import distribution, ranges
+from pacesetter.study.tune.journal import distribution, ranges, within
 from pacesetter.study.tune.search import Tuning
 from pacesetter.training.trainer import Trainer
 
@@ -87,6 +88,22 @@ def test_ranges(name: str) -> None:
             assert getattr(resolve(name, "X-v0", {key: end}).hyper, key) == end
             assert distribution(one)._contains(end)
     assert key not in ranges(hyper, {key: 1})
+
+
+def test_no_warmup_is_searched_in_which_the_budget_ends() -> None:
+    found = ranges(algorithms.find("td3").Hyper, {})
+    assert within(100_000, found) == found
+    assert within(20_000, found)["warmup"] == Tune(1_000, 10_000, log=True)
+    assert within(2_000, found) == {k: v for k, v in found.items() if k != "warmup"}
+    assert within(100, {}) == {}
+
+
+def test_a_study_that_would_never_learn_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["tune", "td3", PROBE, *FLAGS, "--trials", "1"]
+    assert main([*words, "-q", "--study", "a.log"]) == 0
+    assert "warm-up" not in capsys.readouterr().err
+    assert main([*words, "--study", "b.log"]) == 0
+    assert "warmup: all 400 steps are within the warm-up of 1,000" in capsys.readouterr().err
 
 
 def test_what_td3_searches() -> None:

@@ -34,6 +34,18 @@ def ranges(hyper: type, fixed: Settings) -> Ranges:
     }
 
 
+def within(budget: int, searched: Ranges) -> Ranges:
+    """The ranges with a warm-up of at most half the budget, as a trial that never learns says
+    nothing; without it where even the shortest is longer.
+    """
+    if "warmup" not in searched:
+        return searched
+    low, high, log = searched["warmup"]
+    most = min(int(high), budget // 2)
+    left = {name: mark for name, mark in searched.items() if name != "warmup"}
+    return searched | {"warmup": Tune(low, most, log)} if most > low else left
+
+
 def distribution(range_: Tune) -> Any:
     """A range as Optuna's distribution."""
     low, high, log = range_

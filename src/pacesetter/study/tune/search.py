@@ -30,6 +30,7 @@ from pacesetter.study.tune.journal import (
     optuna,
     ranges,
     refuse_foreign,
+    within,
 )
 from pacesetter.text import printable
 from pacesetter.training.trainer import Report, Trainer
@@ -51,7 +52,8 @@ class Tuning:
     ) -> None:
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
         self.config, self.file = resolve(algorithm, env, fixed), Path(file)
-        self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
+        hyper = algorithms.find(self.config.run.algorithm).Hyper
+        self.ranges = within(self.config.budget, ranges(hyper, fixed))
         self.runs = self.file.parent / f"{self.file.name}.runs"
         self._refuse_bad_input()
         self.best_file = self.file.with_suffix(".best.toml")
