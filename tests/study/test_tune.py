@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import broken_envs
+import jax
 import pytest
 from short_runs import TINY
 
@@ -51,6 +52,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = [str(Path(broken_envs.__file__).parent), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     return tmp_path
+
+
+def raiser(error: Exception) -> Any:
+    def tick() -> None:
+        raise error
+
+    return tick
 
 
 def silent(trainer: Trainer) -> Any:
@@ -303,6 +311,44 @@ def test_failed_trial_counts_and_the_study_goes_on(
     assert [state for state, *_ in made(tuning)] == ["FAIL", "COMPLETE"]
     assert "trial 0 of 2: failed: member 0, step 3: a bolt fell out\n" in capsys.readouterr().err
     assert tuning.summary().startswith("1 complete, 0 pruned, 1 failed; best")
+
+
+def test_a_trial_without_memory_fails_and_keeps_no_replay(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Be it the machine's or the device's, which JAX tells by an error of its own."""
+    tuning = study(trials=3)
+    full: Any = iter([MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes")])
+    make = tuning._trainer_of
+
+    def fail(trial: Any) -> Any:
+        trainer = make(trial)
+        if error := next(full, None):
+            monkeypatch.setattr(trainer.loop, "tick", raiser(error))
+        return trainer
+
+    monkeypatch.setattr(tuning, "_trainer_of", fail)
+    tuning.run(silent)
+    assert [state for state, *_ in made(tuning)] == ["FAIL", "FAIL", "COMPLETE"]
+    lines = capsys.readouterr().err
+    assert "trial 0 of 3: failed: out of memory\n" in lines
+    assert "trial 1 of 3: failed: the cpu is out of memory, ask for less" in lines
+    assert len([*find_all(tuning.runs)]) == 3
+    assert not any(run.state_file.parent.exists() for run in find_all(tuning.runs))
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_rest_of_an_odd_budget_is_told_once() -> None:
+    tuning = study(trials=1, steps=250)
+    tuning.run(silent)
+    ((_, _, _, reported),) = made(tuning)
+    assert list(reported) == [1, 2]
+
+
+def test_each_study_has_its_own_best_settings() -> None:
+    names = ("sweep.1", "sweep.2", "sweep.log")
+    best = [study(file=name).best_file.name for name in names]
+    assert best == ["sweep.1.best.toml", "sweep.2.best.toml", "sweep.best.toml"]
 
 
 # Bad input.

@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,8 @@ class Tuning:
         self.ranges = within(self.config.budget, ranges(hyper, fixed))
         self.runs = self.file.parent / f"{self.file.name}.runs"
         self._refuse_bad_input()
-        self.best_file = self.file.with_suffix(".best.toml")
+        # Only .log is no part of the name: sweep.1 and sweep.2 are two studies.
+        self.best_file = self.file.with_name(f"{self.file.name.removesuffix('.log')}.best.toml")
         self._lock, journal = Lock(self.runs / "lock"), Lock(self.runs / "journal.lock")
         self._trainer: Trainer | None = None
         self._stopping = False
@@ -154,8 +156,10 @@ class Tuning:
             self._trainer = trainer = self._trainer_of(trial)
             with show(trainer) as sink:
                 pruned = self._train(trial, trainer, sink)
-        except (TrainingError, UsageError) as error:
-            self._tell(trial, FAILED, None, str(error))
+        except (TrainingError, UsageError, MemoryError) as error:
+            self._tell(trial, FAILED, None, str(error) or "out of memory")
+            if not (directory := self._directory_of(trial)).in_use():
+                directory.remove_checkpoint()
             return
         if not (pruned or trainer.finished):
             return
@@ -167,28 +171,32 @@ class Tuning:
         """Whether it was pruned."""
         if self._stopping:
             trainer.stop()
-        told = self.study.get_trials(deepcopy=False)[trial.number].intermediate_values
+        told = {*self.study.get_trials(deepcopy=False)[trial.number].intermediate_values}
         every = self.config.run.eval_every * self.config.steps_per_count
         for report in trainer:
             sink(report)
             number = report.step // every
             if report.kind != "eval" or number == 0:
                 continue
-            if number not in told:  # a resumed run makes again what it had not saved
+            # A resumed run makes again what it had not saved, and an odd budget ends in a part.
+            if number not in told:
+                told.add(number)
                 trial.report(_score(trainer.directory.rows()), number)
             if trial.should_prune() and not trainer.finished:
                 return True
         return False
 
+    def _directory_of(self, trial: optuna.Trial) -> RunDirectory:
+        run = replace(self.config.run, **_own(trial))
+        return RunDirectory.of(self.runs, self.config._replace(run=run))
+
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
-        given: Settings = {**self.fixed, **trial.params}
-        given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
-        config = resolve(self.algorithm, self.env, given)
-        directory = RunDirectory.of(self.runs, config)
+        given: Settings = {**self.fixed, **trial.params, **_own(trial)}
+        directory = self._directory_of(trial)
         if not present(directory.config_file):
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
-            allow = [self.algorithm, self.env, *config.run.wrap]
+            allow = [self.algorithm, self.env, *self.config.run.wrap]
             now = {key: given[key] for key in ON_RESUME & given.keys()}
             trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow, **now)
         except UsageError as error:  # damaged, which is no reason to stop the study
@@ -223,6 +231,11 @@ class Tuning:
             *(f"{key} = {_toml(value)}" for key, value in (given | best.params).items()),
         ]
         return "\n".join(lines) + "\n"
+
+
+def _own(trial: optuna.Trial) -> Settings:
+    """The settings that only this trial has, beside those that are searched."""
+    return {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
 
 
 def _score(rows: list[Row]) -> float:
