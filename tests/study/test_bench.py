@@ -1,5 +1,7 @@
 """`bench`: what a suite expands to, and that every run is made once, whatever happens."""
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -412,11 +414,31 @@ def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
     for _ in range(5):
         next(steps)
     assert (executor.calls, work.finished) == (["train"], jobs[1:])
-    assert sum("another process has it" in line for line in work.news) == 1
+    assert sum("in use by another process; will retry" in line for line in work.news) == 1
     holder.unlock()
     for _ in steps:
         pass
     assert len(work.finished) == 2
+
+
+def test_run_of_another_machine_is_not_failed(
+    jobs: list[Job], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without locks nobody can tell whether it lives; the bench waits, and says what to do."""
+
+    def no_locks(*arguments: Any) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    lock = jobs[0].directory.path / "lock"
+    lock.parent.mkdir(parents=True)
+    lock.write_text("process 1 on elsewhere\n")
+    work = Bench(jobs)
+    executor = Here(lambda words: lock.unlink() or main(words))
+    for _ in work.run(executor):
+        pass
+    assert (len(work.finished), work.failed) == (2, {})
+    assert any(f"process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
 
 
 def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:

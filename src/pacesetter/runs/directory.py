@@ -252,3 +252,7 @@ class RunDirectory:
     def in_use(self) -> bool:
         """Whether a process holds the folder now."""
         return self._lock.is_held()
+
+    def holder(self) -> str | None:
+        """Who holds the folder now, for people; None if nobody does."""
+        return self._lock.holder()
