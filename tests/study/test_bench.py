@@ -9,9 +9,12 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +31,8 @@ from pacesetter.cli.main import main
 from pacesetter.config import Config, Run, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
+from pacesetter.study.bench import executors, suite
 from pacesetter.study.bench import queue as bench_module
-from pacesetter.study.bench import suite
 from pacesetter.study.bench.executors import Local, run_command
 from pacesetter.study.bench.queue import RETRIES, Bench, Outcome, is_finished
 from pacesetter.study.bench.suite import Job, expand, load
@@ -60,6 +63,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(bench_module, "POLL", 0.01)
     path = [str(Path(broken_envs.__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # for the locks of cores
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     return tmp_path
 
@@ -438,7 +442,7 @@ def test_run_of_another_machine_is_not_failed(
     for _ in work.run(executor):
         pass
     assert (len(work.finished), work.failed) == (2, {})
-    assert any(f"process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
+    assert any("process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
 
 
 def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:
@@ -965,6 +969,29 @@ LEAVES = """#!/bin/sh
 sleep 600 &
 echo $!
 """
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no run can be pinned")
+def test_benches_share_the_cores_out(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of one run each take a core each; where none is left, the slot says which is shared."""
+    (here / "python").write_text("#!/bin/sh\nwhile [ ! -e over ]; do sleep 0.01; done\n")
+    (here / "python").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(here / "python"))
+    monkeypatch.setattr(executors, "cores", lambda: [4, 7])
+    pinned: list[int] = []
+    monkeypatch.setattr(executors, "_pinned", lambda core: pinned.append(core) or nullcontext())
+    benches = [Local(1), Local(1), Local(2)]
+    tasks = [bench.start(0, []) for bench in benches]
+    tasks.append(benches[2].start(1, []))
+    assert pinned == [4, 7, 4, 7]
+    (here / "over").touch()
+    for bench, task in zip((*benches, benches[2]), tasks, strict=True):
+        wait_until(partial(bench.poll, task))
+    both = Local(2)
+    again = [both.start(slot, []) for slot in (1, 0)]
+    assert pinned[4:] == [7, 4]
+    for task in again:
+        wait_until(partial(both.poll, task))
 
 
 @pytest.mark.parametrize("where", ["local", "ray"])

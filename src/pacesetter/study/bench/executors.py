@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.files import make_folder
 from pacesetter.process import CODES, cores
+from pacesetter.runs.lock import Lock
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
 
@@ -27,14 +29,16 @@ class Local:
 
     def start(self, slot: int, words: list[str]) -> Any:
         output = tempfile.TemporaryFile()  # noqa: SIM115, as `poll` closes it
-        with _pinned(self._cores[slot % len(self._cores)]):
-            return _popen(words, output), output
+        core, lock = _claim_core(self._cores, slot)
+        with _pinned(core):
+            return _popen(words, output), output, lock
 
     def poll(self, task: Any) -> Outcome | None:
-        process, output = task
+        process, output, lock = task
         if process.poll() is None:
             return None
         _end(process)
+        lock.free()
         output.seek(0)
         with output:
             return Outcome(process.returncode, output.read().decode(errors="replace"))
@@ -119,6 +123,23 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     """End a command, if it runs, and all that it started: a crash leaves a simulator's helpers."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
+
+
+def _claim_core(cores: list[int], slot: int) -> tuple[int, Lock]:
+    """A core to which no bench of this user has pinned a run, and its lock, held.
+
+    Where all are taken, the core that the slot comes to, which is then shared.
+    """
+    own = slot % len(cores)
+    folder = Path(tempfile.gettempdir()) / f"pacesetter-cores-{os.getuid()}"
+    for core in (*cores[own:], *cores[:own]):
+        lock = Lock(folder / str(core))
+        with suppress(UsageError, OSError):
+            make_folder(folder)
+            if not lock.is_held():
+                lock.take()
+                return core, lock
+    return cores[own], Lock(folder / str(cores[own]))
 
 
 @contextmanager
