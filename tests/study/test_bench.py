@@ -239,6 +239,7 @@ BAD_COMMANDS = {
     "smoke --seeds 2147483648 1": ["seeds", "tune"],
     "smoke --executor sun": ["executor", "sun", "ray"],
     "smoke --env.KEY": ["--env.KEY"],
+    "smoke --address auto": ["address", "--executor ray"],
 }
 
 
@@ -669,6 +670,19 @@ def test_printed_commands(
     train, resume = program.read_text().splitlines()
     assert train == " ".join(["1 -m pacesetter", *jobs[1].words, "-q"])
     assert resume == f"1 -m pacesetter resume {jobs[1].directory.path} --allow {PROBE} -q"
+
+
+def test_a_job_array_has_the_whole_name_of_its_suite(jobs: list[Job]) -> None:
+    assert "#SBATCH --job-name='my suite.v2'\n" in executors.slurm("my suite.v2", jobs)
+
+
+def test_a_wrapper_that_cannot_be_made_stops_the_bench(here: Path) -> None:
+    """Also where another entry has the same task without it."""
+    own = {"envs": [PROBE], "seeds": 1, "wrap": ["odd_envs:MuteWrapper"]}
+    both = suite.of_algorithms(["td3", "sac"])
+    both = both._replace(entries={"sac": own, "td3": {"envs": [PROBE]}}, allow=own["wrap"])
+    with pytest.raises(UsageError, match="MuteWrapper"):
+        Bench(expand(both, {}, "runs")).check_envs()
 
 
 def test_printed_job_array(

@@ -25,6 +25,8 @@ def bench(words: list[str]) -> int:
     """Train every algorithm on every env with every seed; skip what is done."""
     suite, flags, own = _parse(words)
     chosen(own["log"])
+    if own["address"] is not None and own["executor"] != "ray":
+        raise UsageError("address: is that of a Ray cluster; add --executor ray")
     always = () if own["log"] is None else (f"--log={own['log']}",)
     jobs = suites.expand(suite, flags, own["runs"], always)
     if own["print"]:

@@ -19,6 +19,7 @@ from pacesetter.process import CODES, cores
 from pacesetter.runs.lock import Lock
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
+from pacesetter.text import printable
 
 
 class Local:
@@ -199,4 +200,5 @@ exit $code
 def slurm(name: str, jobs: list[Job]) -> str:
     """A job array with one task per run; runs save when Slurm warns before the time limit."""
     lines = "\n".join(shlex.quote(line) for line in commands(jobs))
-    return SLURM.format(name=Path(name).stem, last=len(jobs) - 1, commands=lines)
+    quoted = shlex.quote(printable(name))
+    return SLURM.format(name=quoted, last=len(jobs) - 1, commands=lines)

@@ -117,9 +117,9 @@ class Bench:
 
     def check_envs(self) -> None:
         """Refuse a task that cannot be made, before anything starts."""
-        tasks = {(job.config.run.env, str(job.config.run.env_kwargs)): job for job in self.left}
-        for job in tasks.values():
-            job.config.recipe.make().close()
+        recipes = {str(recipe): recipe for recipe in (job.config.recipe for job in self.left)}
+        for recipe in recipes.values():
+            recipe.make().close()
 
     def run(self, executor: Executor) -> Iterator[None]:
         """Run until all have finished, failed or, after `stop`, saved; yields at each poll."""
