@@ -511,6 +511,12 @@ def test_settings_are_followed_along_the_champions_line(tmp_path: Path) -> None:
     assert row[6] == " ".join(map(str, after[2]))
 
 
+def test_a_return_never_reached_and_a_gap_without_an_error() -> None:
+    never = contents.soon(np.array([np.inf, np.inf, 1.0]))
+    assert (never.text, never.key) == ("never (1 of 3)", np.inf)
+    assert tables.number(math.inf, 2).text == "inf"
+
+
 def test_a_line_is_shortened_at_its_start() -> None:
     assert lineage.shorten([0, 1, 1, 0]) == "0 1x2 0"
     assert lineage.shorten([0, 1] * 10, most=3) == "... 1 0 1"
