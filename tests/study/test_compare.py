@@ -742,6 +742,14 @@ def test_best_of_two_halves_needs_an_evaluation_at_half(tmp_path: Path) -> None:
     assert row[4].text == "-"
 
 
+def test_best_of_two_halves_is_of_runs_that_learned(tmp_path: Path) -> None:
+    """Half of this budget lies within the warm-up."""
+    for seed in range(3):
+        make_run(tmp_path, "Ant-v5", "td3", seed, budget=40_000, evaluations=20)
+    (row,) = contrasts.best_of_two(compare([tmp_path]))[0].rows
+    assert (row[4].text, row[5].text == "-") == ("-", False)
+
+
 def test_speed_of_a_run_that_made_no_step_is_not_known(tmp_path: Path) -> None:
     for seed in range(3):
         small(tmp_path, seed=seed)
