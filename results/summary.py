@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.runs import RunDirectory, find_all
-from pacesetter.storage import as_json
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import Run, compact, read
@@ -62,7 +61,8 @@ APART = ("ensemble", "vary")  # studies of which every policy that was evaluated
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
     """Take finished runs in, one line each; a line of the same task, name and seed gives way."""
     file = HERE / f"{study}.jsonl"
-    old = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    before = file.read_text("utf-8").splitlines() if file.exists() else []
+    old = [json.loads(line) for line in before]
     new: dict[tuple[str, ...], dict[str, Any]] = {}
     for each in (run for folder in folders for run in find_all(folder)):
         line = compact(each)
@@ -74,8 +74,8 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
             if new.setdefault(_key(one), one) is not one:
                 sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
     table = {_key(line): line for line in old} | new
-    lines = [as_json(table[key], separators=(",", ":")) for key in sorted(table)]
-    file.write_text("".join(line + "\n" for line in lines))
+    lines = [json.dumps(table[key], separators=(",", ":")) for key in sorted(table)]
+    file.write_text("".join(line + "\n" for line in lines), "utf-8")
 
 
 def apart(run: RunDirectory, line: dict[str, Any]) -> Iterator[dict[str, Any]]:

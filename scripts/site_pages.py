@@ -89,7 +89,7 @@ def source_page(path: Path) -> str:
 
 def source(path: Path) -> str:
     """A source file as a page."""
-    text = (ROOT / path).read_text()
+    text = (ROOT / path).read_text("utf-8")
     return f"{NO_SEARCH}# {path}\n\n{fence(text, LANGUAGES.get(path.suffix, 'text'))}"
 
 

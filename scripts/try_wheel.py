@@ -7,6 +7,7 @@ Needs those Pythons on PATH or under pyenv. Ends with 1 unless every one was pro
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -31,9 +32,14 @@ COMMANDS = (
 def interpreter(version: str) -> str | None:
     """The newest Python of a minor version: from PATH, else from pyenv."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-    kept = sorted(pyenv.glob(f"versions/{version}.*/bin/python"))
+    kept = sorted(pyenv.glob(f"versions/{version}.*/bin/python"), key=numbers)
     found = [shutil.which(f"python{version}"), *map(str, reversed(kept))]
     return next((path for path in found if path and answers(path, version)), None)
+
+
+def numbers(path: Path) -> list[int]:
+    """Those of the version in a path, by which 3.11.10 comes after 3.11.9."""
+    return [int(number) for number in re.findall(r"\d+", path.parents[1].name)]
 
 
 def answers(path: str, version: str) -> bool:

@@ -104,5 +104,5 @@ def shortened(about: str) -> str:
 
 
 if __name__ == "__main__":
-    FILE.write_text(text())
+    FILE.write_text(text(), "utf-8")
     print(FILE)

@@ -115,6 +115,17 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
     return name, []
 
 
+def merge(*layers: Mapping[str, Any]) -> Settings:
+    """One table of several, of which later ones win; keywords of the task are merged one by one."""
+    merged: Settings = {}
+    for layer in layers:
+        old, new = merged.get("env_kwargs"), layer.get("env_kwargs")
+        merged |= layer
+        if isinstance(old, dict) and isinstance(new, dict):
+            merged["env_kwargs"] = {**old, **new}
+    return merged
+
+
 def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     """Merge defaults, presets and the given layers, of which later ones win; check them once.
 
@@ -123,9 +134,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
     env = full_id(env)
     base, below = preset_layers(name, env)
     hyper_type = algorithms.find(base).Hyper
-    merged: Settings = {"name": name.replace(":", "-")}
-    for layer in (*below, *layers):
-        merged |= layer
+    merged = merge({"name": name.replace(":", "-")}, *below, *layers)
     merged |= {"algorithm": base, "env": env}
     run_names, hyper_names = fields_of(Run).keys(), fields_of(hyper_type).keys()
     for key in merged:

@@ -48,6 +48,7 @@ def test_bash_completes(
     Path("script.sh").write_text(text)
     Path("mine.toml").touch()
     (tmp_path / "runs" / "Ant-v5" / "td3" / "0").mkdir(parents=True)
+    monkeypatch.setenv("CDPATH", str(tmp_path))  # where `cd runs` would print its folder
     lines = [f"try {' '.join(repr(word) for word in words)}" for words in TRIES]
     done = subprocess.run(["bash", "-c", ASK + "\n".join(lines)], capture_output=True, text=True)
     assert done.stderr == ""

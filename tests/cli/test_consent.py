@@ -204,4 +204,6 @@ def test_a_wrapper_that_a_file_names(
         line = capsys.readouterr().err
         assert "wrap: " in line
         assert line.count("\n") == 1
+        flag = "--wrap" if words is train else "--allow"  # which `train` has not
+        assert ("intruder" in wrap) == (f"{flag} intruder:Learner" in line)
     assert "intruder" not in sys.modules

@@ -210,8 +210,10 @@ def test_fetch_keeps_what_it_loads(
     seen = np.ones((4, 3), np.float32)
     assert np.array_equal(load("swing.safetensors")(seen), load(pendulum)(seen))
     assert "exists" in refused(capsys, "fetch", "me/swing")
+    assert main(["fetch", "me/swing", "-o", "my swing.safetensors"]) == 0
+    assert "see `pacesetter eval 'my swing.safetensors'`" in capsys.readouterr().out
     assert "must end in" in refused(capsys, "fetch", "me/swing", "-o", "swing.zip")
-    assert double.call_count == 1
+    assert double.call_count == 2
 
 
 def test_watch_hands_over_what_was_typed(pendulum: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """What is said in several files is the same in all of them."""
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,12 @@ def test_same_pythons() -> None:
     script = (ROOT / "scripts" / "try_wheel.py").read_text()
     assert f"VERSIONS = {tuple(minors)}".replace("'", '"') in script
     assert PROJECT["requires-python"] == f">={minors[0]}"
+
+
+def test_the_newest_python_is_tried() -> None:
+    numbers = runpy.run_path(str(ROOT / "scripts" / "try_wheel.py"))["numbers"]
+    kept = [Path(f"versions/{name}/bin/python") for name in ("3.11.9", "3.11.10", "3.11.2")]
+    assert [path.parts[1] for path in sorted(kept, key=numbers)] == ["3.11.2", "3.11.9", "3.11.10"]
 
 
 def test_targets_that_pages_name_are_there() -> None:

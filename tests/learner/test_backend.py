@@ -7,7 +7,9 @@ import jax
 import pytest
 from short_runs import TINY, assert_same, run_to_end
 
+from pacesetter.errors import TrainingError
 from pacesetter.learner.backend import NUMERICS, made_with, prepare
+from pacesetter.training import trainer as trainers
 from pacesetter.training.trainer import Trainer
 
 PROBE = "broken_envs:Probe-v0"
@@ -59,3 +61,25 @@ def test_a_device_is_that_of_one_run() -> None:
     finally:
         prepare("auto")
     assert jax.config.values["jax_default_device"] is None
+
+
+@pytest.mark.parametrize("text", ["RESOURCE_EXHAUSTED: Out of memory", "INTERNAL: no link"])
+def test_a_fault_of_the_device_is_one_line(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the start, which leaves no folder, and in an update."""
+
+    def fail(*arguments: Any) -> None:
+        raise jax.errors.JaxRuntimeError(text)
+
+    said = f"the cpu {'is out of memory, ask for less' if 'RES' in text else 'fails'}: {text}"
+    with monkeypatch.context() as patch:
+        patch.setattr(trainers, "start_from", fail)
+        with pytest.raises(TrainingError, match=said):
+            Trainer("td3", PROBE, runs=tmp_path / "runs", **TINY)
+    assert not (tmp_path / "runs").exists()
+    trainer = Trainer("td3", PROBE, runs=tmp_path / "runs", **TINY)
+    monkeypatch.setattr(trainer.loop, "tick", fail)
+    with pytest.raises(TrainingError, match=said):
+        run_to_end(trainer)
+    Trainer.resume(trainer.directory.path).close()

@@ -107,6 +107,18 @@ def test_card_says_what_it_is(folder: Path, file: Path) -> None:
     assert result["metrics"][0]["value"] == f"{scored.mean:.2f} +/- {scored.std:.2f}"
 
 
+def test_words_of_a_policy_are_words_of_the_card(folder: Path, file: Path) -> None:
+    """A policy of somebody else's may say anything of itself."""
+    policy = load(file)
+    policy.about.update(seed="[x](y)", versions={"jax": "<b>\n| 1"})
+    policy.save(file)
+    push(file, "someone/pendulum", episodes=1, command="train\n```\n# A title")
+    text = (folder / "someone" / "pendulum" / "README.md").read_text()
+    assert ", seed [x]\\(y) |\n" in text
+    assert "| versions | jax \\<b\\>\\\\n\\| 1 |\n" in text
+    assert "```\ntrain\\n```\\n# A title\n```\n" in text
+
+
 def test_command_is_that_of_the_run_folder_and_a_film_is_played(folder: Path, file: Path) -> None:
     settings = {"algorithm": "td3", "env": "Pendulum-v1", "name": "td3", "seed": 0}
     settings |= {"steps": 1000, "eval_every": 100}

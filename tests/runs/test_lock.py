@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from pacesetter.errors import InUseError, UsageError
+from pacesetter.errors import InUseError
+from pacesetter.runs import lock as lock_module
 from pacesetter.runs.lock import Lock, alone
 
 HOLD = """
@@ -79,7 +80,7 @@ def test_a_killed_holder_holds_nothing(kind: str, tmp_path: Path) -> None:
 def test_another_machine_without_locks_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody can tell whether it still runs, so a person must; whoever waits for it need not."""
+    """Nobody can tell whether it still runs, so a person must, and a run of it is in use."""
     lock = Lock(tmp_path / "lock")
     lock.path.write_text("process 1 on elsewhere\n")
     lock.take()  # with locks, what the text says is of the past
@@ -90,10 +91,14 @@ def test_another_machine_without_locks_is_named(
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
     lock.path.write_text("process 1 on elsewhere\n")
-    assert not lock.is_held()
-    with pytest.raises(UsageError, match=r"process 1 on elsewhere.*remove the file") as refusal:
+    assert lock.is_held()
+    said = rf"process 1 on elsewhere.*remove {lock.path}$"
+    with pytest.raises(InUseError, match=said):
         lock.take()
-    assert not isinstance(refusal.value, InUseError)
+    with pytest.raises(InUseError, match=said), alone(lock):  # which else waits for ever
+        pass
+    lock.path.write_text("")
+    assert not lock.is_held()
 
 
 def test_a_lock_that_was_removed_is_made_again(
@@ -111,4 +116,16 @@ def test_a_lock_that_was_removed_is_made_again(
     lock.take()
     with pytest.raises(InUseError):
         other.take()
+    lock.free()
+
+
+def test_a_look_at_a_lock_keeps_nobody_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`is_held` locks the file for a moment, in which another may start."""
+    lock = Lock(tmp_path / "lock")
+    looking = lock.path.open("w")
+    fcntl.flock(looking, fcntl.LOCK_SH)
+    monkeypatch.setattr(lock_module.time, "sleep", lambda seconds: looking.close())
+    lock.take()
     lock.free()

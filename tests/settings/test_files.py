@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import pacesetter
+from pacesetter.errors import UsageError
 from pacesetter.settings.files import read_file
 
 READ = "import sys; from pacesetter.settings.files import *; print(read_file(Path(sys.argv[1])))"
@@ -22,6 +23,12 @@ def test_a_byte_order_mark_is_no_text(name: str, text: str, tmp_path: Path) -> N
     assert read_file(tmp_path / name) == {"name": "a"}
 
 
+def test_a_name_that_is_no_word_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"settings": {"name": []}}')
+    with pytest.raises(UsageError, match="they cannot be those of td3"):
+        read_file(tmp_path / "a.json", "td3")
+
+
 def test_the_locale_decides_nothing(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_bytes('# später\nname = "Žák"'.encode())
     plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -33,5 +40,7 @@ def test_the_locale_decides_nothing(tmp_path: Path) -> None:
 
 
 def test_text_is_read_and_written_by_a_named_encoding() -> None:
-    files = [path for path in PACKAGE.rglob("*.py") if UNNAMED.search(path.read_text("utf-8"))]
-    assert files == []
+    root = Path(__file__).parents[2]
+    every = [path for folder in (PACKAGE, root / "scripts") for path in folder.rglob("*.py")]
+    every.append(root / "results" / "summary.py")
+    assert [path for path in every if UNNAMED.search(path.read_text("utf-8"))] == []

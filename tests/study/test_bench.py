@@ -1,5 +1,7 @@
 """`bench`: what a suite expands to, and that every run is made once, whatever happens."""
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -7,9 +9,12 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +32,8 @@ from pacesetter.config import Config, Run, resolve
 from pacesetter.errors import UsageError
 from pacesetter.runs import RunDirectory, find_all
 from pacesetter.settings.budget import steps_per_count
+from pacesetter.study.bench import executors, suite
 from pacesetter.study.bench import queue as bench_module
-from pacesetter.study.bench import suite
 from pacesetter.study.bench.executors import Local, run_command
 from pacesetter.study.bench.queue import RETRIES, Bench, Outcome, is_finished
 from pacesetter.study.bench.suite import Job, expand, load
@@ -59,6 +64,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(bench_module, "POLL", 0.01)
     path = [str(Path(broken_envs.__file__).parent), os.environ.get("PYTHONPATH", "")]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # for the locks of cores
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     return tmp_path
 
@@ -234,6 +240,7 @@ BAD_COMMANDS = {
     "smoke --seeds 2147483648 1": ["seeds", "tune"],
     "smoke --executor sun": ["executor", "sun", "ray"],
     "smoke --env.KEY": ["--env.KEY"],
+    "smoke --address auto": ["address", "--executor ray"],
 }
 
 
@@ -413,11 +420,31 @@ def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
     for _ in range(5):
         next(steps)
     assert (executor.calls, work.finished) == (["train"], jobs[1:])
-    assert sum("another process has it" in line for line in work.news) == 1
+    assert sum("in use by another process; will retry" in line for line in work.news) == 1
     holder.unlock()
     for _ in steps:
         pass
     assert len(work.finished) == 2
+
+
+def test_run_of_another_machine_is_not_failed(
+    jobs: list[Job], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without locks nobody can tell whether it lives; the bench waits, and says what to do."""
+
+    def no_locks(*arguments: Any) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    lock = jobs[0].directory.path / "lock"
+    lock.parent.mkdir(parents=True)
+    lock.write_text("process 1 on elsewhere\n")
+    work = Bench(jobs)
+    executor = Here(lambda words: lock.unlink() or main(words))
+    for _ in work.run(executor):
+        pass
+    assert (len(work.finished), work.failed) == (2, {})
+    assert any("process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
 
 
 def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:
@@ -535,6 +562,19 @@ def test_run_of_other_settings_is_refused(
     assert [found.path for found in find_all("runs")] == [jobs[1].directory.path]
 
 
+def test_settings_without_a_result_stop_no_study(jobs: list[Job]) -> None:
+    """A run that goes on takes those of them that `resume` takes."""
+    run(jobs[1:], Here())
+    flags = {"env_timeout": "30s", "checkpoint_every": 9.0, "device": "cpu"}
+    again = expand(load("suite.toml"), flags, "runs")
+    work = Bench(again)
+    assert (work.before, work.failed) == (1, {})
+    words = bench_module.words_of(again[1])
+    assert words[0] == "resume"
+    assert {"--env-timeout=30s", "--checkpoint-every=9.0"} < {*words}
+    assert not any("device" in word for word in words)
+
+
 def test_stop_waits_for_all_and_starts_none(jobs: list[Job]) -> None:
     work = Bench(jobs)
     executor = Here(lambda words: work.stop() or stop_at(200)(words))
@@ -631,6 +671,19 @@ def test_printed_commands(
     train, resume = program.read_text().splitlines()
     assert train == " ".join(["1 -m pacesetter", *jobs[1].words, "-q"])
     assert resume == f"1 -m pacesetter resume {jobs[1].directory.path} --allow {PROBE} -q"
+
+
+def test_a_job_array_has_the_whole_name_of_its_suite(jobs: list[Job]) -> None:
+    assert "#SBATCH --job-name='my suite.v2'\n" in executors.slurm("my suite.v2", jobs)
+
+
+def test_a_wrapper_that_cannot_be_made_stops_the_bench(here: Path) -> None:
+    """Also where another entry has the same task without it."""
+    own = {"envs": [PROBE], "seeds": 1, "wrap": ["odd_envs:MuteWrapper"]}
+    both = suite.of_algorithms(["td3", "sac"])
+    both = both._replace(entries={"sac": own, "td3": {"envs": [PROBE]}}, allow=own["wrap"])
+    with pytest.raises(UsageError, match="MuteWrapper"):
+        Bench(expand(both, {}, "runs")).check_envs()
 
 
 def test_printed_job_array(
@@ -942,6 +995,29 @@ echo $!
 """
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no run can be pinned")
+def test_benches_share_the_cores_out(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of one run each take a core each; where none is left, the slot says which is shared."""
+    (here / "python").write_text("#!/bin/sh\nwhile [ ! -e over ]; do sleep 0.01; done\n")
+    (here / "python").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(here / "python"))
+    monkeypatch.setattr(executors, "cores", lambda: [4, 7])
+    pinned: list[int] = []
+    monkeypatch.setattr(executors, "_pinned", lambda core: pinned.append(core) or nullcontext())
+    benches = [Local(1), Local(1), Local(2)]
+    tasks = [bench.start(0, []) for bench in benches]
+    tasks.append(benches[2].start(1, []))
+    assert pinned == [4, 7, 4, 7]
+    (here / "over").touch()
+    for bench, task in zip((*benches, benches[2]), tasks, strict=True):
+        wait_until(partial(bench.poll, task))
+    both = Local(2)
+    again = [both.start(slot, []) for slot in (1, 0)]
+    assert pinned[4:] == [7, 4]
+    for task in again:
+        wait_until(partial(both.poll, task))
+
+
 @pytest.mark.parametrize("where", ["local", "ray"])
 def test_what_a_crashed_run_leaves_running_is_ended(
     where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -980,3 +1056,34 @@ def test_a_keyword_of_none_stays_none(capsys: pytest.CaptureFixture[str]) -> Non
     line = capsys.readouterr().out
     assert "--env.render_mode=none" in line
     assert "null" not in line
+
+
+@pytest.mark.parametrize("value", [float("inf"), [0.5, float("-inf")], {"a": None}, "a 🦿", 1e-9])
+def test_a_keyword_is_the_same_in_a_runs_command(value: Any) -> None:
+    flags = {"envs": ["Pendulum-v1"], "env_kwargs": {"key": value}}
+    (job,) = expand(suite.of_algorithms(["td3"]), flags, "runs")
+    assert parsed(job.words).run.env_kwargs == {"key": value}
+
+
+def test_an_algorithm_of_the_current_folder(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (here / "mine_of_bench.py").write_text("from pacesetter.algorithms.td3 import TD3 as Learner")
+    words = ["bench", "--algos", "mine_of_bench:Learner", "--envs", "Pendulum-v1", "--seeds", "1"]
+    assert main([*words, "--print", "commands"]) == 0
+    assert "train mine_of_bench:Learner Pendulum-v1" in capsys.readouterr().out
+
+
+def test_keywords_are_merged_one_by_one(here: Path) -> None:
+    """Of the suite, its file, the entry, its table for the task, and the flags."""
+    (here / "mine.toml").write_text("env_kwargs = {a = 2, b = 2, c = 2, d = 2}")
+    (here / "suite.toml").write_text(
+        'envs = ["Pendulum-v1"]\nenv_kwargs = {e = 1, a = 1}\n[entries.td3]\n'
+        'config = "mine.toml"\nenv_kwargs = {b = 3, c = 3, d = 3}\n'
+        '[entries.td3.env."Pendulum-*"]\nenv_kwargs = {c = 4, d = 4}\n'
+    )
+    (job,) = expand(load("suite.toml"), {"env_kwargs": {"d": 5}}, "runs")
+    assert job.config.run.env_kwargs == {"e": 1, "a": 2, "b": 3, "c": 4, "d": 5}
+    one = resolve("td3", "Pendulum-v1", {"env_kwargs": {"a": 1, "b": 1}}, {"env_kwargs": {"b": 2}})
+    assert one.run.env_kwargs == {"a": 1, "b": 2}

@@ -31,6 +31,7 @@ from pacesetter.study.report.published import sources
 from pacesetter.training.trainer import Trainer
 
 ROOT = Path(__file__).parents[2]
+SELECTED = [5, 0.0, 1.0, [0], 0]
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +105,7 @@ def test_what_is_not_found_is_one_line(runs: Path, word: str, said: str, tmp_pat
         ({"varied": [{"gamma": [0.9]}, {"gamma": [0.9]}]}, "varied: must have a row"),
         ({"varied": [{"gamma": [0.9, 0.8]}]}, "1 values of each setting"),
         ({"varied": [{"gamma": "high"}]}, "varied.0.gamma"),
+        ({"selections": [SELECTED], "varied": [{"tau": [1]}, {"x": [1]}]}, "varied: must name"),
         ({"resumed": [{"versions": 3}]}, "resumed.0.versions"),
         ({"settings": {}}, "is missing"),
     ],
@@ -119,6 +121,13 @@ def test_a_foreign_line_is_refused(
     assert re.search(said, why)
     with pytest.raises(UsageError, match=f"none can be read: .*{said}"):
         compare([file])
+
+
+@pytest.mark.parametrize("odd", [{"lr_horizon": "20k"}, {"replay_horizon": [1]}, {"rule": []}])
+def test_an_odd_setting_is_refused(tmp_path: Path, odd: dict[str, Any]) -> None:
+    run = small(tmp_path, select_window=None, **odd)
+    with pytest.raises(UsageError, match=f"settings.{next(iter(odd))}: should be"):
+        compare([run], budget=10_000)
 
 
 def test_a_line_without_one_of_its_keys_is_read_or_refused(runs: Path, tmp_path: Path) -> None:
@@ -211,6 +220,15 @@ def test_several_budgets_are_refused_unless_cut_or_mixed(tmp_path: Path) -> None
     assert [run.updates[-1] for run in cut.runs] == [0, 0]  # a cut run's ledger is cut too
 
 
+def test_one_budget_for_runs_that_evaluate_at_other_steps(tmp_path: Path) -> None:
+    """None of them has an evaluation at the budget, and a smaller one would not help either."""
+    make_run(tmp_path, "Ant-v5", "td3", budget=120_000, evaluations=24)
+    make_run(tmp_path, "Ant-v5", "sac", budget=120_000, evaluations=40)
+    found = compare([tmp_path], budget="100k")
+    assert [run.clock[-1] for run in found.runs] == [99_000, 100_000]
+    assert any("(eval_every)" in note for note in found.notes)
+
+
 def test_equal_cpu_time_cuts_each_run_where_it_stood(tmp_path: Path) -> None:
     """Runs of other lengths need no --mixed then; one that never spent so much is left out."""
     small(tmp_path, seed=0)
@@ -236,6 +254,13 @@ def test_a_setting_that_only_newer_runs_have_is_no_difference(tmp_path: Path) ->
 def test_uncounted_selection_steps_are_told(tmp_path: Path) -> None:
     small(tmp_path, name="multi-td3", count_selection_steps=False)
     assert any("Steps of selection come on top" in note for note in compare([tmp_path]).notes)
+
+
+def test_a_version_is_of_the_task_and_not_of_its_keywords() -> None:
+    assert split("Walker2d-v5") == ("Walker2d", "v5")
+    kept = "xml_file=robot-v1.xml"
+    assert split(f"Walker2d-v5 {kept}") == (f"Walker2d {kept}", "v5")
+    assert split(f"mine:Robot {kept}") == (f"mine:Robot {kept}", "-")
 
 
 def test_the_paper_suites_ant_stands_in_the_papers_tables(tmp_path: Path) -> None:
@@ -487,6 +512,12 @@ def test_settings_are_followed_along_the_champions_line(tmp_path: Path) -> None:
     assert row[6] == " ".join(map(str, after[2]))
 
 
+def test_a_return_never_reached_and_a_gap_without_an_error() -> None:
+    never = contents.soon(np.array([np.inf, np.inf, 1.0]))
+    assert (never.text, never.key) == ("never (1 of 3)", np.inf)
+    assert tables.number(math.inf, 2).text == "inf"
+
+
 def test_a_line_is_shortened_at_its_start() -> None:
     assert lineage.shorten([0, 1, 1, 0]) == "0 1x2 0"
     assert lineage.shorten([0, 1] * 10, most=3) == "... 1 0 1"
@@ -710,6 +741,14 @@ def test_best_of_two_halves_needs_an_evaluation_at_half(tmp_path: Path) -> None:
         make_run(tmp_path, "Ant-v5", "td3", seed, budget=100_000, evaluations=5)
     row = contrasts.best_of_two(compare([tmp_path]))[0].rows[0]
     assert row[4].text == "-"
+
+
+def test_best_of_two_halves_is_of_runs_that_learned(tmp_path: Path) -> None:
+    """Half of this budget lies within the warm-up."""
+    for seed in range(3):
+        make_run(tmp_path, "Ant-v5", "td3", seed, budget=40_000, evaluations=20)
+    (row,) = contrasts.best_of_two(compare([tmp_path]))[0].rows
+    assert (row[4].text, row[5].text == "-") == ("-", False)
 
 
 def test_speed_of_a_run_that_made_no_step_is_not_known(tmp_path: Path) -> None:

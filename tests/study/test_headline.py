@@ -12,15 +12,15 @@ from pacesetter.study.report.headline import headline
 def runs(folder: Path, levels: dict[str, float], seeds: int, env: str = "Ant-v5") -> None:
     for name, level in levels.items():
         for seed in range(seeds):
-            make_run(folder, env, name, seed, level=level, budget=20_000, evaluations=10)
+            make_run(folder, env, name, seed, level=level, budget=40_000, evaluations=10)
 
 
 @pytest.mark.parametrize(
     ("levels", "seeds", "said"),
     [
-        ({"td3": 1_000}, 1, ["td3 on Ant-v5 has a final return of", "(1 run of 20k steps)"]),
+        ({"td3": 1_000}, 1, ["td3 on Ant-v5 has a final return of", "(1 run of 40k steps)"]),
         ({"td3": 1_000, "sac": 2_000}, 1, ["sac has the highest", "cannot tell this from chance"]),
-        ({"td3": 1_000, "sac": 1_010}, 3, ["cannot tell the two apart", "3 runs of 20k steps"]),
+        ({"td3": 1_000, "sac": 1_010}, 3, ["cannot tell the two apart", "3 runs of 40k steps"]),
         ({"td3": 1_000, "sac": 9_000}, 3, ["sac", "beyond chance", "fewer than 5 seeds"]),
         ({"td3": 1_000, "sac": 9_000}, 5, ["highest final return, ", "beyond chance"]),
         ({"td3": 9_000, "sac": 5, "crossq": 50}, 5, ["td3 has the", "of 3 algorithms"]),
@@ -66,7 +66,8 @@ def test_single_runs_are_not_told_apart_by_an_interval(tmp_path: Path) -> None:
 
 def test_what_is_not_known_is_not_ranked(tmp_path: Path) -> None:
     """A largest return is of evaluations after the first update, which some runs never had."""
-    runs(tmp_path, {"td3": 1_000, "sac": 2_000}, 1)
+    for name, level in (("td3", 1_000), ("sac", 2_000)):
+        make_run(tmp_path, "Ant-v5", name, level=level, budget=20_000, evaluations=10)
     line = headline(compare([tmp_path], metric="max"))
     assert line == "No maximum return is known: no evaluation came after a first update."
     make_run(tmp_path, "Ant-v5", "ddpg", budget=100_000, evaluations=10)
@@ -74,3 +75,25 @@ def test_what_is_not_known_is_not_ranked(tmp_path: Path) -> None:
     assert line.startswith("ddpg on Ant-v5 has a maximum return of")
     assert "Not known, without an evaluation after the first update: sac on Ant-v5, td3" in line
     assert "inf" not in line
+
+
+def test_who_made_no_update_is_not_ahead(tmp_path: Path) -> None:
+    """Its warm-up is longer than the budget, and what it scores is luck."""
+    runs(tmp_path, {"td3": 9_000, "sac": 1_000}, 5)
+    for path in tmp_path.glob("*/sac/*/metrics.jsonl"):  # whose warm-up was shorter
+        path.write_text(path.read_text().replace('"updates": 0', '"updates": 9'))
+    found = compare([tmp_path], budget="20k")
+    line = headline(found)
+    assert line.startswith("sac on Ant-v5 has a final return of")
+    assert "Not known, without an evaluation after the first update: td3 on Ant-v5." in line
+    (note,) = [each for each in found.notes if each.startswith("Made no update")]
+    assert "Ant-v5 td3 seed 4" in note
+    assert "sac" not in note
+    assert not any(each.startswith("Made no") for each in compare([tmp_path]).notes)
+
+
+def test_a_control_that_is_not_there_is_told(tmp_path: Path) -> None:
+    runs(tmp_path, {"td3": 1_000, "sac": 9_000}, 1)
+    note = "No algorithm tt3 is among the runs, so none is compared with it."
+    assert note in compare([tmp_path], reference="tt3").notes
+    assert note not in compare([tmp_path], reference="sac").notes

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import broken_envs
+import jax
 import pytest
 from short_runs import TINY
 
@@ -21,9 +23,10 @@ from pacesetter.cli.progress import console
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.runs import RunDirectory, find, find_all
+from pacesetter.settings.values import Tune
 from pacesetter.study.bench.suite import TUNING_SEEDS, expand, of_algorithms
 from pacesetter.study.tune import search as tune
-from pacesetter.study.tune.journal import distribution, ranges
+from pacesetter.study.tune.journal import distribution, ranges, within
 from pacesetter.study.tune.search import Tuning
 from pacesetter.training.trainer import Trainer
 
@@ -49,6 +52,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = [str(Path(broken_envs.__file__).parent), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     return tmp_path
+
+
+def raiser(error: Exception) -> Any:
+    def tick() -> None:
+        raise error
+
+    return tick
 
 
 def silent(trainer: Trainer) -> Any:
@@ -86,6 +96,22 @@ def test_ranges(name: str) -> None:
             assert getattr(resolve(name, "X-v0", {key: end}).hyper, key) == end
             assert distribution(one)._contains(end)
     assert key not in ranges(hyper, {key: 1})
+
+
+def test_no_warmup_is_searched_in_which_the_budget_ends() -> None:
+    found = ranges(algorithms.find("td3").Hyper, {})
+    assert within(100_000, found) == found
+    assert within(20_000, found)["warmup"] == Tune(1_000, 10_000, log=True)
+    assert within(2_000, found) == {k: v for k, v in found.items() if k != "warmup"}
+    assert within(100, {}) == {}
+
+
+def test_a_study_that_would_never_learn_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["tune", "td3", PROBE, *FLAGS, "--trials", "1"]
+    assert main([*words, "-q", "--study", "a.log"]) == 0
+    assert "warm-up" not in capsys.readouterr().err
+    assert main([*words, "--study", "b.log"]) == 0
+    assert "warmup: all 400 steps are within the warm-up of 1,000" in capsys.readouterr().err
 
 
 def test_what_td3_searches() -> None:
@@ -145,6 +171,21 @@ def test_best_is_what_train_takes(capsys: pytest.CaptureFixture[str]) -> None:
     settings = find("td3/0").settings()
     assert {key: settings[key] for key in best.params} == best.params
     assert (settings["steps"], settings["seed"], settings["hidden"]) == (200, 0, [16, 16])
+
+
+def test_the_command_of_the_best_settings_can_be_typed() -> None:
+    """A file whose name has a space, and wrappers, which `train` takes from its own words alone."""
+    tuning = study(1, file="my study.log", wrap=("odd_envs:Doubled",))
+    tuning.run(silent)
+    line, *_ = tuning.best_file.read_text().splitlines()
+    words = ["train", "td3", PROBE, "--config", "my study.best.toml", "--wrap", "odd_envs:Doubled"]
+    assert shlex.split(line) == ["#", "pacesetter", *words]
+    assert main([*words, "--steps", "20", "-q"]) == 0
+
+
+def test_values_of_the_best_settings_are_toml() -> None:
+    given = {"a 🦿": [0.5, float("inf")], "b": {"c": True, "d": 1e-9}, "e": float("-inf")}
+    assert tomllib.loads(f"x = {tune._toml(given)}")["x"] == given
 
 
 def test_report_seeds_are_never_tuning_seeds() -> None:
@@ -272,6 +313,44 @@ def test_failed_trial_counts_and_the_study_goes_on(
     assert tuning.summary().startswith("1 complete, 0 pruned, 1 failed; best")
 
 
+def test_a_trial_without_memory_fails_and_keeps_no_replay(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Be it the machine's or the device's, which JAX tells by an error of its own."""
+    tuning = study(trials=3)
+    full: Any = iter([MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: 9 bytes")])
+    make = tuning._trainer_of
+
+    def fail(trial: Any) -> Any:
+        trainer = make(trial)
+        if error := next(full, None):
+            monkeypatch.setattr(trainer.loop, "tick", raiser(error))
+        return trainer
+
+    monkeypatch.setattr(tuning, "_trainer_of", fail)
+    tuning.run(silent)
+    assert [state for state, *_ in made(tuning)] == ["FAIL", "FAIL", "COMPLETE"]
+    lines = capsys.readouterr().err
+    assert "trial 0 of 3: failed: out of memory\n" in lines
+    assert "trial 1 of 3: failed: the cpu is out of memory, ask for less" in lines
+    assert len([*find_all(tuning.runs)]) == 3
+    assert not any(run.state_file.parent.exists() for run in find_all(tuning.runs))
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_rest_of_an_odd_budget_is_told_once() -> None:
+    tuning = study(trials=1, steps=250)
+    tuning.run(silent)
+    ((_, _, _, reported),) = made(tuning)
+    assert list(reported) == [1, 2]
+
+
+def test_each_study_has_its_own_best_settings() -> None:
+    names = ("sweep.1", "sweep.2", "sweep.log")
+    best = [study(file=name).best_file.name for name in names]
+    assert best == ["sweep.1.best.toml", "sweep.2.best.toml", "sweep.best.toml"]
+
+
 # Bad input.
 
 BAD = {
@@ -311,6 +390,14 @@ def test_nothing_left_to_search() -> None:
              ranges(algorithms.find("td3").Hyper, {})}  # fmt: skip
     with pytest.raises(UsageError, match="no setting is left to search"):
         study(**given)
+
+
+def test_settings_without_a_score_are_no_other_study() -> None:
+    study()
+    again = study(env_timeout="30s", checkpoint_every=9.0, device="cpu")
+    assert again.config.run.env_timeout == 30
+    with pytest.raises(UsageError, match=r"range of gamma=\[0.97, 0.999, False\], not None"):
+        study(gamma=0.99)
 
 
 def test_study_of_something_else_is_refused() -> None:

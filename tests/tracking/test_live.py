@@ -299,3 +299,18 @@ def test_a_run_that_met_its_goal_is_over(runs: Path) -> None:
     met = make_run(runs, budget=2_000, planned=4_000, evaluations=4, name="met", stop_at=0.0)
     for path, over in ((met, True), (make_run(runs, budget=2_000, planned=4_000), False)):
         assert curve(evaluated(path, EVALUATIONS))["is_over"] is over
+
+
+def test_a_closed_tab_is_no_news(run: RunDirectory, capsys: pytest.CaptureFixture[str]) -> None:
+    with serving(lambda: [run]) as server:
+        for error in (BrokenPipeError(), ConnectionResetError()):
+            try:
+                raise error
+            except OSError:
+                server.handle_error(None, ("127.0.0.1", 1))
+        assert capsys.readouterr().err == ""
+        try:
+            raise KeyError("mean")
+        except KeyError:
+            server.handle_error(None, ("127.0.0.1", 1))
+        assert "KeyError: 'mean'" in capsys.readouterr().err

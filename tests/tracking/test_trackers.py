@@ -159,6 +159,8 @@ def test_a_tracker_that_is_not_installed_stops_the_command_before_the_run(
     bench = ["bench", "--algos", "td3", "--envs", TASK, "--runs", str(runs), "--log", "wandb"]
     assert main(bench) == 2
     assert capsys.readouterr().err == f"pacesetter: {line}\n"
+    assert train(runs, "--log", "none,tensorboard") == 2
+    assert "log: none stands alone or not at all" in capsys.readouterr().err
     assert train(runs, "--log", "tensorbord") == 2
     assert "unknown 'tensorbord'; did you mean tensorboard?" in capsys.readouterr().err
 
@@ -202,7 +204,7 @@ def test_a_tracker_that_cannot_be_opened_stops_the_run(
     path = runs / "probe_envs-Scripted-v0" / "td3" / "0"
     assert capsys.readouterr().err == (
         "pacesetter: stopped: log: shut failed: ConnectionError: no server at all; "
-        f"`pacesetter resume {path} --log none` goes on without it\n"
+        f"`pacesetter resume {path} --allow {TASK} --log none` goes on without it\n"
     )
     assert main(["resume", str(path), "--log", "none", "-q"]) == 0
 
@@ -215,7 +217,7 @@ def test_a_damaged_record_is_one_line(
 ) -> None:
     assert train(runs) == 0
     path = runs / "probe_envs-Scripted-v0" / "td3" / "0"
-    for text in ("{", "[]", json.dumps({"id": 1}), json.dumps(FOREIGN)):
+    for text in ("{", "[]", json.dumps({"id": 1}), json.dumps(FOREIGN), "[" * 99_999):
         (path / "trackers.json").write_text(text)
         capsys.readouterr()
         assert main(["resume", str(path), "--steps", "300", "-q"]) == 2

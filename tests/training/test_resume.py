@@ -1,6 +1,7 @@
 """A run that is stopped and resumed equals the run that never stopped, bit for bit."""
 
 import gc
+import math
 import weakref
 from pathlib import Path
 from typing import Any
@@ -190,3 +191,18 @@ def test_a_trainer_that_is_dropped_takes_its_programs_along(algorithm: str, runs
         assert compiled() is None
     finally:
         gc.enable()
+
+
+def test_an_infinite_keyword_of_a_task_is_kept(runs: Path) -> None:
+    """As in Hopper's own default. Nan is refused, since no run could be told to have it."""
+    same = {**TINY, "steps": 60, "env_kwargs": {"healthy_z_range": [0.5, math.inf]}}
+    trainer = Trainer("td3", "Hopper-v5", runs=runs, **same)
+    trainer.loop.tick()
+    trainer.save()
+    trainer.close()
+    directory = run_to_end(Trainer.resume(trainer.directory.path))
+    assert directory.settings()["env_kwargs"] == same["env_kwargs"]
+    assert directory.difference_from(trainer.config) is None
+    run_to_end(Trainer("td3", "Hopper-v5", runs=runs, seed=1, **same))
+    with pytest.raises(UsageError, match="tables: nan equals nothing"):
+        Trainer("td3", "Hopper-v5", runs=runs, name="x", env_kwargs={"x": [math.nan]})

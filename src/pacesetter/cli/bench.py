@@ -5,7 +5,7 @@ import shlex
 import sys
 from typing import Any
 
-from pacesetter.cli.flags import Parser, add_settings, parser, split_env_kwargs
+from pacesetter.cli.flags import Parser, add_settings, look_here, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
 from pacesetter.config import Run, preset_layers
 from pacesetter.errors import UsageError
@@ -25,6 +25,8 @@ def bench(words: list[str]) -> int:
     """Train every algorithm on every env with every seed; skip what is done."""
     suite, flags, own = _parse(words)
     chosen(own["log"])
+    if own["address"] is not None and own["executor"] != "ray":
+        raise UsageError("address: is that of a Ray cluster; add --executor ray")
     always = () if own["log"] is None else (f"--log={own['log']}",)
     jobs = suites.expand(suite, flags, own["runs"], always)
     if own["print"]:
@@ -41,6 +43,7 @@ def _parse(words: list[str]) -> tuple[Suite, Settings, dict[str, Any]]:
     suite = _suite(name, first.algos) if name or first.algos else None
     if suite is not None:
         named = [*first.allow, *(first.algos or [])]
+        look_here(*named)  # their settings are flags, which `parse` needs already
         suite = suite._replace(allow=named)
         suites.require_named(suite, named, vars(first).get("envs", []))
         _add_settings_of(suite, command)

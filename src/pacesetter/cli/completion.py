@@ -11,11 +11,11 @@ from pacesetter.errors import unknown
 SHELLS = ("bash", "zsh", "tcsh")
 INSTALL = "pacesetter[completion]"
 # Names of runs, as `find` takes them (env/name/seed), and files. Folders may come from others: bash
-# quotes their names, so that none is ever run as a command.
+# quotes their names, so that none is ever run as a command. By ./ no folder of CDPATH is meant.
 PREAMBLE = {
     "bash": f"""_pacesetter_runs() {{
   local name
-  (cd {RUNS} 2>/dev/null && shopt -s nullglob && for name in */*/[0-9]*; do
+  (cd ./{RUNS} 2>/dev/null && shopt -s nullglob && for name in */*/[0-9]*; do
     [[ $name == "$1"* ]] && printf "%q\\n" "$name"
   done)
   compgen -f -- "$1" | while IFS= read -r name; do
@@ -23,7 +23,7 @@ PREAMBLE = {
   done
 }}""",
     "zsh": f"""_pacesetter_runs() {{
-  compadd -- ${{(f)"$(cd {RUNS} 2>/dev/null && print -rl -- */*/[0-9]*(N))"}}
+  compadd -- ${{(f)"$(cd ./{RUNS} 2>/dev/null && print -rl -- */*/[0-9]*(N))"}}
   _files
 }}""",
 }

@@ -180,9 +180,9 @@ def _value(text: str) -> Any:
 
 
 def _json(text: str) -> Any:
-    """A table as JSON writes it, or else the text."""
+    """A table, list or word as JSON writes it, or else the text."""
     try:
-        return json.loads(text) if text.startswith(("{", "[")) else text
+        return json.loads(text) if text.startswith(("{", "[", '"')) else text
     except (ValueError, RecursionError):
         return text
 

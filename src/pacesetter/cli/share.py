@@ -1,5 +1,6 @@
 """The verbs `export`, `push` and `fetch`: a policy for other programs and other people."""
 
+import shlex
 from pathlib import Path
 
 from pacesetter.cli.flags import parser
@@ -75,8 +76,9 @@ def fetch(words: list[str]) -> int:
     except OSError as error:
         raise UsageError(f"fetch: cannot write {file}: {error.strerror}") from None
     about = policy.about
+    see = shlex.join(["pacesetter", "eval", str(file)])
     made = f"{about.get('algorithm', 'a policy')} on {about.get('env', 'no named task')}"
-    print(f"{file}: {made}, step {about.get('step', 0):,}; see `pacesetter eval {file}`")
+    print(f"{file}: {made}, step {about.get('step', 0):,}; see `{see}`")
     return 0
 
 

@@ -1,6 +1,7 @@
 """The verb `tune`."""
 
 import shlex
+import sys
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, algorithm_and_env, parser, split_env_kwargs
@@ -14,10 +15,17 @@ STEPS = 100_000  # of a trial
 def tune(words: list[str]) -> int:
     """Search the settings of ALGO on ENV that score best, with Optuna."""
     algorithm, env, fixed, own = _parse(words)
+    from pacesetter.cli.advice import within_warmup
     from pacesetter.cli.progress import console
     from pacesetter.study.tune.search import Tuning
 
     tuning = Tuning(algorithm, env, fixed, own["trials"], own["study"])
+    if (
+        not own["quiet"]
+        and "warmup" not in tuning.ranges
+        and (line := within_warmup(tuning.config))
+    ):
+        print(f"pacesetter: {line}", file=sys.stderr)
     with aside(), stopping(tuning.stop) as received:
         tuning.run(lambda trainer: console(trainer, own["quiet"]))
     print(tuning.summary())

@@ -1,12 +1,14 @@
 """What a run asks of JAX: its device, its numbers, and where compiled programs are kept."""
 
 import os
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import TrainingError, UsageError
 from pacesetter.process import cores, threads
 
 # JAX's own defaults, held fast: the numbers of a seed depend on them.
@@ -41,6 +43,17 @@ def prepare(device: str) -> list[str]:
     _refuse_no_device()
     jax.config.update("jax_default_device", None if device == "auto" else _device(device))
     return notes
+
+
+@contextmanager
+def device_faults() -> Generator[None]:
+    """Tell a fault of the device, such as too little memory, as a TrainingError."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        full = "RESOURCE_EXHAUSTED" in str(error)
+        what = "is out of memory, ask for less" if full else "fails"
+        raise TrainingError(f"the {platform()} {what}: {error}") from error
 
 
 def made_with(products: str) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """A policy in the form of another program: one verb, one line that says what was written."""
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,8 @@ def export(
             )
             return (
                 f"{path}: {episodes} episodes, return {np.mean(made):,.1f} +- {np.std(made):,.1f}; "
-                f"load it by MINARI_DATASETS_PATH={path.parent} and "
-                f"minari.load_dataset('{path.name}')"
+                f"load it by MINARI_DATASETS_PATH={shlex.quote(str(path.parent))} and "
+                f"minari.load_dataset({path.name!r})"
             )
         case "sb3":
             file = to_sb3(policy, path, env=env, env_kwargs=env_kwargs)

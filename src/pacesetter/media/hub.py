@@ -12,6 +12,7 @@ from pacesetter.files import present
 from pacesetter.media.extras import need
 from pacesetter.policy import Policy, load
 from pacesetter.runs import RunDirectory
+from pacesetter.text import markdown, printable
 
 INSTALL = "pacesetter[hub]"
 FILE, CARD, VIDEO = "policy.safetensors", "README.md", "replay.mp4"  # the hub plays a replay.mp4
@@ -121,8 +122,8 @@ def card(
     found = made_with.items() if isinstance(made_with, dict) else ()
     versions = (f"{name} {number}" for name, number in found)
     rows.append(("versions", ", ".join(versions)))
-    table = "\n".join(f"| {name} | {value} |" for name, value in rows)
-    trained = f"\n## Training\n\n```\n{command}\n```\n" if command else ""
+    table = "\n".join(f"| {name} | {markdown(str(value))} |" for name, value in rows)
+    trained = f"\n## Training\n\n```\n{printable(command)}\n```\n" if command else ""
     return (
         f"---\n{_data(policy, fresh)}\n---\n\n# {about.get('algorithm')} on {about.get('env')}\n\n"
         f"A policy trained by pacesetter. Returns are undiscounted sums of rewards, "

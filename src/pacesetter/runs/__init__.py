@@ -2,7 +2,9 @@
 
 from pacesetter.runs.directory import (
     FREE_PER_SEED,
+    ON_RESUME,
     SCHEMA,
+    WITHOUT_RESULT,
     RunDirectory,
 )
 from pacesetter.runs.finding import find, find_all, find_each, find_group, find_matching
@@ -10,7 +12,9 @@ from pacesetter.runs.log import Row
 
 __all__ = [
     "FREE_PER_SEED",
+    "ON_RESUME",
     "SCHEMA",
+    "WITHOUT_RESULT",
     "Row",
     "RunDirectory",
     "find",

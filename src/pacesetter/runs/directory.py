@@ -26,12 +26,13 @@ from pacesetter.runs.log import Log, Row
 from pacesetter.runs.provenance import provenance
 from pacesetter.runs.records import SCHEMA, check_record
 from pacesetter.settings.validation import difference
-from pacesetter.storage import as_json
 
 CONFIG = "config.json"
+WITHOUT_RESULT = {"checkpoint_every", "device", "env_timeout"}  # settings that change none
+ON_RESUME = {"checkpoint_every", "env_timeout"}  # those of them that `resume` takes anew
 # Settings in which the seeds of one name may differ.
 HORIZONS = {"replay_horizon", "lr_horizon"}
-FREE_PER_SEED = {"seed", "steps", "time", "checkpoint_every", "device", "env_timeout"} | HORIZONS
+FREE_PER_SEED = {"seed", "steps", "time"} | WITHOUT_RESULT | HORIZONS
 
 
 class RunDirectory:
@@ -93,14 +94,18 @@ class RunDirectory:
         return ["resume", str(self.path), *words(run.algorithm, run.env, *run.wrap)]
 
     def difference_from(self, config: Config) -> str | None:
-        """The first setting in which the run here differs; None if none does, or no run is here."""
+        """The first setting of another result in which the run here differs.
+
+        None if none does, or no run is here.
+        """
         if not present(self.config_file):
             return None
         old, new, own = self.settings(), config.settings(), ("algorithm", "env")
         if found := difference(old, new, own):  # a name of the file's own is not even looked up
             return found
         named = [*(new[name] for name in own), *old.get("wrap", ())]  # wrappers are only compared
-        return difference(self.config(named).settings(), new, new)
+        keys = [key for key in new if key not in WITHOUT_RESULT]
+        return difference(self.config(named).settings(), new, keys)
 
     def _refuse_other_seeds(self, config: Config) -> None:
         """Refuse a new seed whose settings differ from those of the other seeds of its name."""
@@ -166,7 +171,9 @@ class RunDirectory:
             last.rmdir()
 
     def _write_config(self, table: Row) -> None:
-        write_atomically(self.config_file, (as_json(table, indent=1) + "\n").encode())
+        # With Infinity, which other readers may not take: a task's keyword may be infinite, and
+        # with null in its place the run would be another.
+        write_atomically(self.config_file, (json.dumps(table, indent=1) + "\n").encode())
 
     def record(self) -> Row:
         """The whole config.json."""
@@ -245,3 +252,7 @@ class RunDirectory:
     def in_use(self) -> bool:
         """Whether a process holds the folder now."""
         return self._lock.is_held()
+
+    def holder(self) -> str | None:
+        """Who holds the folder now, for people; None if nobody does."""
+        return self._lock.holder()

@@ -7,17 +7,22 @@ import platform
 import re
 import time
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from pacesetter.errors import InUseError, UsageError
+from pacesetter.errors import InUseError
 from pacesetter.files import regular
 
 # What flock answers where the file system, such as some network ones, has no locks.
 _NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}
 WAIT = 0.02  # seconds between two tries to get a lock
+TRIES = 3  # before a lock counts as held: `is_held` has it too, for a moment
 WITHOUT = "its file system has no locks, so only this machine knows that this process has it"
+
+
+class ElsewhereError(InUseError):
+    """Held by a process of another machine, as the text says, which nobody here can ask."""
 
 
 class Lock:
@@ -39,7 +44,7 @@ class Lock:
         """
         file = _open(self.path, "a+")
         try:
-            self.is_weak = not _flock(file, fcntl.LOCK_EX)
+            self.is_weak = not _flock_soon(file)
             if self.is_weak:
                 self._refuse_holder(file)
         except BlockingIOError:
@@ -68,31 +73,49 @@ class Lock:
 
     def is_held(self) -> bool:
         """Whether a process holds the file now; False if that cannot be told."""
+        return self.holder() is not None
+
+    def holder(self) -> str | None:
+        """Who holds the file now, for people; None if nobody does or that cannot be told."""
         try:
             with _open(self.path, "r") as file:
-                return not _flock(file, fcntl.LOCK_SH) and _lives(_text(file))
+                if _flock(file, fcntl.LOCK_SH):
+                    return None
+                text = _text(file)
+                return text if _lives(text) else self._elsewhere(text)
         except BlockingIOError:
-            return True
+            return "another process"
         except OSError:
-            return False
+            return None
 
     def _refuse_holder(self, file: IO[str]) -> None:
-        holder = _text(file)
-        if _lives(holder):
+        text = _text(file)
+        if _lives(text):
             raise BlockingIOError
-        if holder and not holder.endswith(f" on {platform.node()}"):
-            raise UsageError(
-                f"lock: {self.path} names {holder}, and on a file system without locks nobody can "
-                "tell whether that still runs; if it does not, remove the file"
-            )
+        if holder := self._elsewhere(text):
+            raise ElsewhereError(f"{self.path.parent} is in use by {holder}")
+
+    def _elsewhere(self, text: str) -> str | None:
+        """The holder if it is of another machine, and what a person can do about it."""
+        if not text or text.endswith(f" on {platform.node()}"):
+            return None
+        return (
+            f"{text}, and on a file system without locks nobody can tell whether that still runs; "
+            f"if it does not, remove {self.path}"
+        )
 
 
 def wait_for(lock: Lock) -> None:
-    """Take a lock as soon as it is free."""
+    """Take a lock as soon as it is free.
+
+    Raises ElsewhereError where nobody can tell whether it will ever be.
+    """
     while True:
         try:
             lock.take()
             return
+        except ElsewhereError:
+            raise
         except InUseError:
             time.sleep(WAIT)
 
@@ -120,6 +143,15 @@ def _flock(file: IO[str], kind: int) -> bool:
             raise
         return False
     return True
+
+
+def _flock_soon(file: IO[str]) -> bool:
+    """Lock a file for this process alone, unless it stays locked for some tries."""
+    for _ in range(TRIES - 1):
+        with suppress(BlockingIOError):
+            return _flock(file, fcntl.LOCK_EX)
+        time.sleep(WAIT)
+    return _flock(file, fcntl.LOCK_EX)
 
 
 def _is_at(path: Path, file: IO[str]) -> bool:

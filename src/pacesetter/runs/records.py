@@ -30,6 +30,9 @@ class _Settings(BaseModel):
     wrap: list[str] = []
     stop_at: Finite | None = None
     stop_patience: Positive | None = None
+    replay_horizon: Positive | None = None
+    lr_horizon: Positive | None = None
+    rule: str = ""
 
 
 class _Made(BaseModel):

@@ -24,7 +24,7 @@ def read_file(path: Path, name: str | None = None) -> Settings:
     found: Any = table.get("settings", table)
     if not isinstance(found, dict):
         raise UsageError(f"config: settings in {path} must be a table")
-    whole = {found.get("algorithm"), found.get("name")} if "settings" in table else {name}
+    whole = [found.get("algorithm"), found.get("name")] if "settings" in table else [name]
     if name is not None and name not in whole:
         raise UsageError(
             f"config: {path} holds all settings of a run of {found.get('algorithm')}; "

@@ -13,9 +13,15 @@ from pacesetter.text import check_id
 TWO_VALUES = "needs its lowest and its highest value"
 
 
+def _constant(word: str) -> float:
+    if word == "NaN":
+        raise ValueError("nan equals nothing, so no run could be told to have it")
+    return float(word)
+
+
 def _check_json(value: dict[str, Any]) -> dict[str, Any]:
     try:
-        json.dumps(value)
+        json.loads(json.dumps(value), parse_constant=_constant)
     except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"must be plain numbers, words, lists and tables: {error}") from None
     return value

@@ -1,6 +1,7 @@
 """A page on this machine with the curves of runs, read off their logs as they grow."""
 
 import json
+import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from functools import lru_cache
@@ -112,12 +113,19 @@ def serving(runs: Runs, port: int = 0) -> Generator[ThreadingHTTPServer]:
         find = staticmethod(runs)
 
     try:
-        server = ThreadingHTTPServer((ADDRESS, port), Handler)
+        server = _Server((ADDRESS, port), Handler)
         Handler.hosts = tuple(f"{name}:{server.server_port}" for name in (ADDRESS, "localhost"))
     except (OSError, OverflowError) as error:
         raise UsageError(f"port: cannot use {port}: {error}; give another, or none") from None
     with server:
         yield server
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a tab that was closed before its answer; all else is a fault of ours."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -2,12 +2,14 @@
 
 import json
 import re
+import shlex
 import sys
 import uuid
 from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
+from pacesetter.consent import words
 from pacesetter.errors import TrainingError, UsageError, unknown
 from pacesetter.files import present, read_bytes, write_atomically
 from pacesetter.media.extras import look_for
@@ -24,6 +26,8 @@ def chosen(text: str | None) -> list[str] | None:
     if text is None:
         return None
     names = [] if text == NONE else text.split(",")
+    if NONE in names:
+        raise UsageError(f"log: {NONE} stands alone or not at all, got '{text}'")
     for name in names:
         if name not in SINKS:
             raise unknown("log", name, [*SINKS, NONE])
@@ -68,8 +72,11 @@ def _open(stack: ExitStack, name: str, run: Tracked) -> Write:
     except UsageError:
         raise
     except Exception as error:
-        resume = f"`pacesetter resume {run.folder} --log {NONE}` goes on without it"
-        raise TrainingError(f"log: {_failed(name, error)}; {resume}") from error
+        own = run.settings
+        allow = words(own["algorithm"], own["env"], *own.get("wrap", ()))  # old ones name none
+        resume = shlex.join(["pacesetter", "resume", str(run.folder), *allow, "--log", NONE])
+        said = f"log: {_failed(name, error)}; `{resume}` goes on without it"
+        raise TrainingError(said) from error
     stack.callback(_close, name, sink)
     return write
 
@@ -121,5 +128,5 @@ def _record(directory: RunDirectory) -> dict[str, Any]:
             raise ValueError(f"id {table['id']}")
         lists = {key: [*map(str, table[key])] for key in ("trackers", "known")}
         return {"id": table["id"]} | lists
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UsageError(f"{file}: damaged: {error}; remove it") from None

@@ -7,14 +7,14 @@ from typing import Any
 from pacesetter import storage
 from pacesetter.config import Config, resolve
 from pacesetter.errors import UsageError
-from pacesetter.runs import RunDirectory
+from pacesetter.runs import WITHOUT_RESULT, RunDirectory
 from pacesetter.settings import Settings
 
 KIND = "checkpoint"
 SCHEMA = 4
 # What a run is given anew by flags of `resume`, or what changes no result of it.
 BUDGETS = {"steps", "time", "stop_at", "stop_patience"}
-FREE_ON_RESUME = BUDGETS | {"name", "env_timeout", "checkpoint_every", "device"}
+FREE_ON_RESUME = BUDGETS | WITHOUT_RESULT | {"name"}
 
 
 class Refused(UsageError):  # noqa: N818

@@ -15,7 +15,7 @@ from pacesetter.envs import apart
 from pacesetter.envs.tasks import Factory, name_of
 from pacesetter.errors import TaskError, TrainingError, UsageError, told
 from pacesetter.learner import products
-from pacesetter.learner.backend import made_with, prepare
+from pacesetter.learner.backend import device_faults, made_with, prepare
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory, find
 from pacesetter.settings import OnPolicy
@@ -44,6 +44,7 @@ class Trainer:
     @overload  # presets and algorithms of other people
     def __init__(self, algorithm: str, env: str | Factory, **settings: Any) -> None: ...
 
+    @device_faults()
     def __init__(
         self,
         algorithm: str,
@@ -60,7 +61,7 @@ class Trainer:
         """
         layers = [read_file(Path(config), algorithm)] if config else []
         if layers and "wrap" not in settings:
-            require_all("wrap", layers[0].get("wrap", ()))
+            require_all("wrap", layers[0].get("wrap", ()), flag="--wrap")
         self.config = resolve(algorithm, name_of(env), *layers, settings)
         self.directory = RunDirectory.of(runs, self.config)
         self.directory.refuse_existing(self.config)
@@ -77,6 +78,7 @@ class Trainer:
         self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
 
     @classmethod
+    @device_faults()
     def resume(
         cls,
         run: str | Path,
@@ -146,6 +148,10 @@ class Trainer:
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""
+        with device_faults():
+            yield from self._train()
+
+    def _train(self) -> Iterator[Report]:
         self._refuse_closed()
         self._reporter.start_clock()
         self._saved_at = self.progress.wall_seconds

@@ -14,9 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.files import make_folder
 from pacesetter.process import CODES, cores
+from pacesetter.runs.lock import Lock
 from pacesetter.study.bench.queue import ALONE, Outcome
 from pacesetter.study.bench.suite import Job
+from pacesetter.text import printable
 
 
 class Local:
@@ -27,14 +30,16 @@ class Local:
 
     def start(self, slot: int, words: list[str]) -> Any:
         output = tempfile.TemporaryFile()  # noqa: SIM115, as `poll` closes it
-        with _pinned(self._cores[slot % len(self._cores)]):
-            return _popen(words, output), output
+        core, lock = _claim_core(self._cores, slot)
+        with _pinned(core):
+            return _popen(words, output), output, lock
 
     def poll(self, task: Any) -> Outcome | None:
-        process, output = task
+        process, output, lock = task
         if process.poll() is None:
             return None
         _end(process)
+        lock.free()
         output.seek(0)
         with output:
             return Outcome(process.returncode, output.read().decode(errors="replace"))
@@ -121,6 +126,23 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         os.killpg(process.pid, signal.SIGKILL)
 
 
+def _claim_core(cores: list[int], slot: int) -> tuple[int, Lock]:
+    """A core to which no bench of this user has pinned a run, and its lock, held.
+
+    Where all are taken, the core that the slot comes to, which is then shared.
+    """
+    own = slot % len(cores)
+    folder = Path(tempfile.gettempdir()) / f"pacesetter-cores-{os.getuid()}"
+    for core in (*cores[own:], *cores[:own]):
+        lock = Lock(folder / str(core))
+        with suppress(UsageError, OSError):
+            make_folder(folder)
+            if not lock.is_held():
+                lock.take()
+                return core, lock
+    return cores[own], Lock(folder / str(cores[own]))
+
+
 @contextmanager
 def _pinned(core: int) -> Generator[None]:
     """Pin processes started in here to one core from their first instruction, if it can be."""
@@ -178,4 +200,5 @@ exit $code
 def slurm(name: str, jobs: list[Job]) -> str:
     """A job array with one task per run; runs save when Slurm warns before the time limit."""
     lines = "\n".join(shlex.quote(line) for line in commands(jobs))
-    return SLURM.format(name=Path(name).stem, last=len(jobs) - 1, commands=lines)
+    quoted = shlex.quote(printable(name))
+    return SLURM.format(name=quoted, last=len(jobs) - 1, commands=lines)

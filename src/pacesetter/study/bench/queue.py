@@ -117,9 +117,9 @@ class Bench:
 
     def check_envs(self) -> None:
         """Refuse a task that cannot be made, before anything starts."""
-        tasks = {(job.config.run.env, str(job.config.run.env_kwargs)): job for job in self.left}
-        for job in tasks.values():
-            job.config.recipe.make().close()
+        recipes = {str(recipe): recipe for recipe in (job.config.recipe for job in self.left)}
+        for recipe in recipes.values():
+            recipe.make().close()
 
     def run(self, executor: Executor) -> Iterator[None]:
         """Run until all have finished, failed or, after `stop`, saved; yields at each poll."""
@@ -150,8 +150,8 @@ class Bench:
         for slot in set(range(executor.slots)) - self.running.keys():
             for _ in range(len(self._waiting)):
                 job = self._waiting.popleft()
-                if job.directory.in_use():  # by another bench, or left by one that was killed
-                    self._set_aside(job)
+                if holder := job.directory.holder():  # another bench, or the run of a killed one
+                    self._set_aside(job, holder)
                 elif is_finished(job):
                     self._finish(job)
                 else:
@@ -169,15 +169,15 @@ class Bench:
 
     def _end(self, job: Job, words: list[str], outcome: Outcome, stopped: bool) -> None:
         overtaken = words[0] == "train" and files.present(job.directory.config_file)
-        held = outcome.code == IN_USE and job.directory.in_use()
+        holder = job.directory.holder() if outcome.code == IN_USE else None
         if is_finished(job):
             self._finish(job)
         elif stopped:
             self.news.append(f"{job}: stopped")
         elif outcome.code in SAVED:
             self._waiting.append(job)
-        elif held or (outcome.code == BAD_INPUT and overtaken):
-            self._set_aside(job)
+        elif holder or (outcome.code == BAD_INPUT and overtaken):
+            self._set_aside(job, holder or "another process")
         elif outcome.code == BAD_INPUT or self._failures[str(job)] == RETRIES:
             self._fail(job, words, outcome)
         else:
@@ -185,11 +185,11 @@ class Bench:
             self._waiting.append(job)
             self.news.append(f"{job}: failed, {_last_line(outcome)}; trying again")
 
-    def _set_aside(self, job: Job) -> None:
+    def _set_aside(self, job: Job, holder: str) -> None:
         self._waiting.append(job)
         if str(job) not in self._aside:
             self._aside.add(str(job))
-            self.news.append(f"{job}: another process has it; will retry when it is free")
+            self.news.append(f"{job}: in use by {holder}; will retry when it is free")
 
     def _finish(self, job: Job) -> None:
         self.finished.append(job)

@@ -7,10 +7,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pacesetter.config import Config, full_id, resolve
+from pacesetter.config import Config, full_id, merge, resolve
 from pacesetter.consent import require, require_all
 from pacesetter.errors import UsageError, unknown
-from pacesetter.runs import RunDirectory
+from pacesetter.runs import ON_RESUME, RunDirectory
 from pacesetter.settings import Settings
 from pacesetter.settings.files import read_file
 
@@ -118,28 +118,28 @@ def expand(
         try:
             for env in _envs(merged.get("envs")):
                 below = _file(suite, merged.get("config"), env)
-                own = {**suite.shared, **below, **_for_env(entry, env), **flags}
+                own = merge(suite.shared, below, *_for_env(entry, env), flags)
                 if "wrap" not in flags:
                     require_all("wrap", own.get("wrap", ()), suite.allow)
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
-    jobs = [job._replace(always=always) for job in jobs]
+    again = {key: flags[key] for key in sorted(ON_RESUME & flags.keys())}
+    jobs = [job._replace(always=(*always, *_flags(again))) for job in jobs]
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
-def _for_env(entry: Settings, env: str) -> Settings:
+def _for_env(entry: Settings, env: str) -> Iterable[Settings]:
     """An entry's settings for a task: `env."PATTERN"` tables win over the rest, as in presets."""
     by_env: Any = entry.get("env", {})
     if not isinstance(by_env, dict) or not all(isinstance(t, dict) for t in by_env.values()):
         raise UsageError('env: must be tables of settings by task, such as env."HalfCheetah-*"')
-    found = {key: value for key, value in entry.items() if key != "env"}
+    yield {key: value for key, value in entry.items() if key != "env"}
     for pattern, table in by_env.items():
         if own := sorted(OF_ENTRIES & table.keys()):
             raise UsageError(f'{own[0]}: is of the whole entry; it cannot stand in env."{pattern}"')
         if fnmatchcase(env, pattern):
-            found |= _with_underscores(table)
-    return found
+            yield _with_underscores(table)
 
 
 def _jobs(
@@ -179,7 +179,9 @@ def _flags(settings: Settings) -> Iterable[str]:
 
 def _keyword(value: Any) -> str:
     """A keyword of an env as `--env.KEY` reads it."""
-    return "none" if value is None else json.dumps(value)
+    if value is None:
+        return "none"
+    return repr(value) if isinstance(value, float) else json.dumps(value)  # inf, not Infinity
 
 
 def _envs(value: Any) -> list[str]:

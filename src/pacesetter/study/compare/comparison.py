@@ -72,6 +72,8 @@ def compare(
     grouped = groupby(kept, lambda run: (run.env, run.name))
     groups = [Group(env, name, list(same)) for (env, name), same in grouped]
     notes += _remarks(groups, kept, limit)
+    if reference != CONTROL and reference not in {run.name for run in kept}:
+        notes.append(f"No algorithm {reference} is among the runs, so none is compared with it.")
     return Comparison(groups, metric, reference, notes, found.damaged)
 
 
@@ -132,7 +134,8 @@ def _mixtures(runs: list[Run], mixed: bool, limit: Limit) -> list[str]:
         if len(several) > 1:
             faults.append(f"env: {task} in the versions {', '.join(sorted(several))}")
     budgets = sorted({run.budget for run in runs})
-    if len(budgets) > 1 and not limit.cpu:
+    # A limit leaves only what reached it, and then the last evaluations up to it may lie apart.
+    if len(budgets) > 1 and not (limit.budget or limit.cpu):
         shown = ", ".join(f"{budget:,}" for budget in budgets)
         faults.append(
             f"budget: runs of {shown} env steps; --budget {budgets[0]} takes each up to it"
@@ -172,10 +175,15 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     if few:
         names = _few([f"{group.env} {group.name} (n={len(group.runs)})" for group in few])
         notes.append(f"Indicative only, for fewer than {stats.FEWEST_SEEDS} seeds: {names}.")
+    if idle := [_called(run) for run in runs if not run.has_learned]:
+        notes.append(
+            "Made no update, so their numbers are those of the policies that they began with, and "
+            f"the first sentence ranks none of them: {_few(idle)}."
+        )
     counted = [(run, int(run.counted.sum())) for run in runs]
     short = [(run, many) for run, many in counted if many < stats.FEWEST_EVALUATIONS]
     if short:
-        names = _few([f"{run.env} {run.name} seed {run.seed} ({many})" for run, many in short])
+        names = _few([f"{_called(run)} ({many})" for run, many in short])
         notes.append(
             f"Fewer than {stats.FEWEST_EVALUATIONS} evaluations after the first update, so the "
             f"last one counts alone: {names}. A smaller --eval-every gives more."
@@ -208,7 +216,7 @@ def _is_told(made: Row, key: str) -> bool:
 def _unfinished_schedules(runs: list[Run]) -> list[str]:
     """A note on runs that are cut within a schedule that was meant for a longer run."""
     within = [
-        f"{run.env} {run.name} seed {run.seed}"
+        _called(run)
         for run in runs
         if any((run.settings.get(key) or 0) > run.settings["steps"] for key in HORIZONS)
     ]
@@ -218,6 +226,10 @@ def _unfinished_schedules(runs: list[Run]) -> list[str]:
         "Cut before their schedule (learning rate, importance of the replay) has ended, so a run "
         f"of this budget would differ: {_few(within)}."
     ]
+
+
+def _called(run: Run) -> str:
+    return f"{run.env} {run.name} seed {run.seed}"
 
 
 def _few(words: list[str], most: int = 6) -> str:

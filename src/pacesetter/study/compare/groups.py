@@ -119,5 +119,6 @@ def split(env: str) -> tuple[str, str]:
     if env.startswith(ANT):
         task, version = split(env.replace(ANT, "Ant", 1))
         return task, f"{version}, 111"
-    found = re.fullmatch(r"(.*)-(v\d+)(.*)", env)
-    return (found[1] + found[3], found[2]) if found else (env, "-")
+    name, space, keywords = env.partition(" ")
+    found = re.fullmatch(r"(.*)-(v\d+)(.*)", name)
+    return (found[1] + found[3] + space + keywords, found[2]) if found else (env, "-")

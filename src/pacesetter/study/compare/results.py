@@ -136,10 +136,15 @@ class Run:
         return float(learned.max()) if learned.size else np.nan
 
     @property
+    def has_learned(self) -> bool:
+        """Whether an evaluation is of a policy that has been updated."""
+        return bool((self.updates > 0).any())
+
+    @property
     def counted(self) -> NDArray[np.bool_]:
         """Which evaluations (N,) count for the final return."""
         learned = self.updates > 0
-        return learned if learned.any() else np.ones_like(learned)
+        return learned if self.has_learned else np.ones_like(learned)
 
     @property
     def makers(self) -> list[Row]:
@@ -226,6 +231,8 @@ def read(source: str, table: Any, folder: Path | None = None) -> Run | None:
         varied: list[Any] = table.get("varied", [])
         if varied and len(varied) != len(rows) + 1:
             raise ValueError("varied: must have a row at the start and one per selection")
+        if any(row.keys() != varied[0].keys() for row in varied):
+            raise ValueError("varied: must name the same settings in each row")
         if any(len(each) != members for row in varied for each in row.values()):
             raise ValueError(f"varied: must have {members} values of each setting")
     except (ValueError, TypeError, LookupError) as error:

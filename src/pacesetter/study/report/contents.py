@@ -114,7 +114,8 @@ def speed(comparison: Comparison) -> Table:
 def soon(reached: Array) -> Cell:
     middle = float(np.median(reached))
     arrived = int(np.isfinite(reached).sum())
-    return Cell(f"{number(middle).text} ({arrived} of {len(reached)})", middle)
+    text = "never" if np.isinf(middle) else number(middle).text
+    return Cell(f"{text} ({arrived} of {len(reached)})", middle)
 
 
 def runs(comparison: Comparison) -> Table:

@@ -104,6 +104,7 @@ def best_of_two(comparison: Comparison) -> list[Table]:
         half = control.cut(budget // 2)
         enough = min(len(run.steps) for run in half.runs) >= stats.FEWEST_EVALUATIONS
         enough = enough and half.budgets == [budget // 2]  # else no evaluation was there
+        enough = enough and all(run.has_learned for run in half.runs)
         # Half a run is no run of half the budget where a schedule was meant for the whole.
         enough = enough and not any(run.settings.get(key) for run in half.runs for key in HORIZONS)
         one = stats.mean(control.values(comparison.metric))

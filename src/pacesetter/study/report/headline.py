@@ -16,13 +16,19 @@ MOST = 6  # algorithms that a sentence names
 def headline(comparison: Comparison) -> str:
     """Who is ahead, by how much, and whether these runs can tell."""
     metric = comparison.metric
-    known = [group for group in comparison.groups if np.isfinite(group.values(metric)).all()]
+    known = [group for group in comparison.groups if _is_known(group, metric)]
     if not known:
         return f"No {NAMES[metric].lower()} is known: no evaluation came after a first update."
     unknown = [f"{x.name} on {x.env}" for x in comparison.groups if x not in known]
     more = f"; and {len(unknown) - MOST} more" if len(unknown) > MOST else ""
     rest = f" Not known, without an evaluation after the first update: {', '.join(unknown[:MOST])}"
     return _sentence(replace(comparison, groups=known)) + (f"{rest}{more}." if unknown else "")
+
+
+def _is_known(group: Group, metric: str) -> bool:
+    """Whether each run has a number, and of a policy that has learned at all."""
+    learned = all(run.has_learned for run in group.runs)
+    return learned and bool(np.isfinite(group.values(metric)).all())
 
 
 def _sentence(comparison: Comparison) -> str:

@@ -39,9 +39,7 @@ def number(value: float, digits: int = 0, unit: str = "") -> Cell:
     """A cell of one number; `-` where there is none."""
     if np.isnan(value):
         return Cell("-")
-    if np.isinf(value):
-        return Cell("never", value)
-    return Cell(f"{value:,.{digits}f}{unit}", value)
+    return Cell(f"{value:,.{digits}f}{unit}", value)  # or inf
 
 
 def interval(found: Interval, digits: int = 0, after: str = "") -> Cell:

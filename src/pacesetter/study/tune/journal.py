@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.runs import WITHOUT_RESULT
 from pacesetter.runs.lock import Lock, alone, wait_for
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import difference, fields_of
@@ -20,6 +21,7 @@ except ImportError:
     raise UsageError("tune: Optuna is not installed; pip install 'pacesetter[tune]'") from None
 
 Ranges = dict[str, Tune]
+RANGE = "range of "  # before the name of a setting that a study searches
 
 
 def ranges(hyper: type, fixed: Settings) -> Ranges:
@@ -30,6 +32,18 @@ def ranges(hyper: type, fixed: Settings) -> Ranges:
         for mark in info.metadata
         if isinstance(mark, Tune) and name not in fixed
     }
+
+
+def within(budget: int, searched: Ranges) -> Ranges:
+    """The ranges with a warm-up of at most half the budget, as a trial that never learns says
+    nothing; without it where even the shortest is longer.
+    """
+    if "warmup" not in searched:
+        return searched
+    low, high, log = searched["warmup"]
+    most = min(int(high), budget // 2)
+    left = {name: mark for name, mark in searched.items() if name != "warmup"}
+    return searched | {"warmup": Tune(low, most, log)} if most > low else left
 
 
 def distribution(range_: Tune) -> Any:
@@ -51,7 +65,7 @@ def open_study(
     file holds a study with other settings.
     """
     study = _read(file, lock, patience)
-    about = settings | {f"range of {name}": mark for name, mark in searched.items()}
+    about = settings | {f"{RANGE}{name}": mark for name, mark in searched.items()}
     new: Settings = json.loads(json.dumps(about))
     old = study.user_attrs.get("about")
     if old is None:
@@ -59,7 +73,11 @@ def open_study(
         usual = {name: settings[name] for name in searched}
         study.enqueue_trial({k: v for k, v in usual.items() if searched[k].has(v)})
         return study
-    if found := difference(old, new, {**old, **new}):
+    # What changes no score is no difference, nor is a setting that another version did not have.
+    shared = [key for key in settings if key in old and key not in WITHOUT_RESULT]
+    if found := difference(
+        old, new, [*shared, *(k for k in {**old, **new} if k.startswith(RANGE))]
+    ):
         raise UsageError(f"study: {file} has {found}; give another --study")
     return study
 

@@ -5,9 +5,11 @@ resumes its trial from the checkpoint, so no heartbeat is needed.
 """
 
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.files import make_folder, present, sync_folder, write_atomically
-from pacesetter.runs import Row, RunDirectory, find_all
+from pacesetter.runs import ON_RESUME, Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
 from pacesetter.study.bench.suite import TUNING_SEEDS
@@ -29,7 +31,9 @@ from pacesetter.study.tune.journal import (
     optuna,
     ranges,
     refuse_foreign,
+    within,
 )
+from pacesetter.text import printable
 from pacesetter.training.trainer import Report, Trainer
 
 RUNNING, COMPLETE = optuna.trial.TrialState.RUNNING, optuna.trial.TrialState.COMPLETE
@@ -49,10 +53,12 @@ class Tuning:
     ) -> None:
         self.algorithm, self.env, self.fixed, self.trials = algorithm, env, fixed, trials
         self.config, self.file = resolve(algorithm, env, fixed), Path(file)
-        self.ranges = ranges(algorithms.find(self.config.run.algorithm).Hyper, fixed)
+        hyper = algorithms.find(self.config.run.algorithm).Hyper
+        self.ranges = within(self.config.budget, ranges(hyper, fixed))
         self.runs = self.file.parent / f"{self.file.name}.runs"
         self._refuse_bad_input()
-        self.best_file = self.file.with_suffix(".best.toml")
+        # Only .log is no part of the name: sweep.1 and sweep.2 are two studies.
+        self.best_file = self.file.with_name(f"{self.file.name.removesuffix('.log')}.best.toml")
         self._lock, journal = Lock(self.runs / "lock"), Lock(self.runs / "journal.lock")
         self._trainer: Trainer | None = None
         self._stopping = False
@@ -150,8 +156,10 @@ class Tuning:
             self._trainer = trainer = self._trainer_of(trial)
             with show(trainer) as sink:
                 pruned = self._train(trial, trainer, sink)
-        except (TrainingError, UsageError) as error:
-            self._tell(trial, FAILED, None, str(error))
+        except (TrainingError, UsageError, MemoryError) as error:
+            self._tell(trial, FAILED, None, str(error) or "out of memory")
+            if not (directory := self._directory_of(trial)).in_use():
+                directory.remove_checkpoint()
             return
         if not (pruned or trainer.finished):
             return
@@ -163,29 +171,34 @@ class Tuning:
         """Whether it was pruned."""
         if self._stopping:
             trainer.stop()
-        told = self.study.get_trials(deepcopy=False)[trial.number].intermediate_values
+        told = {*self.study.get_trials(deepcopy=False)[trial.number].intermediate_values}
         every = self.config.run.eval_every * self.config.steps_per_count
         for report in trainer:
             sink(report)
             number = report.step // every
             if report.kind != "eval" or number == 0:
                 continue
-            if number not in told:  # a resumed run makes again what it had not saved
+            # A resumed run makes again what it had not saved, and an odd budget ends in a part.
+            if number not in told:
+                told.add(number)
                 trial.report(_score(trainer.directory.rows()), number)
             if trial.should_prune() and not trainer.finished:
                 return True
         return False
 
+    def _directory_of(self, trial: optuna.Trial) -> RunDirectory:
+        run = replace(self.config.run, **_own(trial))
+        return RunDirectory.of(self.runs, self.config._replace(run=run))
+
     def _trainer_of(self, trial: optuna.Trial) -> Trainer:
-        given: Settings = {**self.fixed, **trial.params}
-        given |= {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
-        config = resolve(self.algorithm, self.env, given)
-        directory = RunDirectory.of(self.runs, config)
+        given: Settings = {**self.fixed, **trial.params, **_own(trial)}
+        directory = self._directory_of(trial)
         if not present(directory.config_file):
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
-            allow = [self.algorithm, self.env, *config.run.wrap]
-            trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow)
+            allow = [self.algorithm, self.env, *self.config.run.wrap]
+            now = {key: given[key] for key in ON_RESUME & given.keys()}
+            trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow, **now)
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
@@ -207,15 +220,22 @@ class Tuning:
 
     def _best_toml(self, best: optuna.trial.FrozenTrial) -> str:
         run = self.config.run
+        words = ["train", self.algorithm, run.env, "--config", str(self.best_file)]
+        words += ["--wrap", *run.wrap] if run.wrap else []  # which a file alone may not name
         given = {k: self.config.settings()[k] for k in self.fixed if k not in ("steps", "time")}
         lines = [
-            f"# pacesetter train {self.algorithm} {run.env} --config {self.best_file}",
+            f"# pacesetter {printable(shlex.join(words))}",
             f"# Return {best.value:.1f} at {run.steps:,} steps in trial {best.number}, with seed "
             f"{TUNING_SEEDS + best.number}: the best of",
             "# many, so biased upwards; only runs with other seeds tell what these settings give.",
             *(f"{key} = {_toml(value)}" for key, value in (given | best.params).items()),
         ]
         return "\n".join(lines) + "\n"
+
+
+def _own(trial: optuna.Trial) -> Settings:
+    """The settings that only this trial has, beside those that are searched."""
+    return {"name": f"trial-{trial.number}", "seed": TUNING_SEEDS + trial.number}
 
 
 def _score(rows: list[Row]) -> float:
@@ -229,7 +249,9 @@ def _score(rows: list[Row]) -> float:
 
 
 def _toml(value: Any) -> str:
-    """A value as TOML, which reads JSON's numbers, words and lists."""
+    """A value as TOML, which reads JSON's words, but no Infinity and no emoji in two halves."""
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
-    return json.dumps(value)
+        return "{" + ", ".join(f"{_toml(k)} = {_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
