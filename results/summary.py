@@ -71,6 +71,7 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
             print(f"left out as unfinished: {each.path}", file=sys.stderr)
             continue
         for one in [line, *(apart(each, line) if study in APART else ())]:
+            read(str(each.path), one)
             if new.setdefault(_key(one), one) is not one:
                 sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
     table = {_key(line): line for line in old} | new
@@ -94,7 +95,8 @@ def apart(run: RunDirectory, line: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 for values, each in zip(line["evaluations"], returns, strict=True)
             ]
             settings = line["settings"] | {"name": f"{line['settings']['name']}-{name}"}
-            yield line | {"settings": settings, "evaluations": changed, "selections": []}
+            start = {"varied": line["varied"][:1]} if "varied" in line else {}
+            yield line | {"settings": settings, "evaluations": changed, "selections": []} | start
 
 
 def _key(line: dict[str, Any]) -> tuple[str, ...]:
@@ -107,7 +109,7 @@ def shown(study: str, limit: dict[str, str]) -> str:
     """The tables of a study at one place."""
     there = compare([HERE / f"{study}.jsonl"], **limit, mixed=True)
     found = [contents.details(there), contents.speed(there), *contrasts.against(there)]
-    if study in APART:
+    if study == "ensemble":
         found += contrasts.together(there)
     found += [*contrasts.best_of_two(there), contents.ledger(there.groups)]
     if study == "frontier":

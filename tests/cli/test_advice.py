@@ -65,7 +65,8 @@ def test_a_run_of_days_is_said_once() -> None:
 
 def test_a_run_of_hours_is_not() -> None:
     assert Clockwork("crossq", 100.0).lines(200) == []
-    assert Clockwork("crossq", 100.0, time="8h").lines(200) == []
+    assert Clockwork("crossq", 6.0).lines(200) != []
+    assert Clockwork("crossq", 6.0, time="8h").lines(200) == [], "its length is known"
 
 
 def test_settings_too_slow_for_the_machine_are_said_however_short_the_run() -> None:
@@ -94,7 +95,8 @@ def test_bench_says_it_of_each_entry(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(words) == 0
     lines = [line for line in capsys.readouterr().err.splitlines() if "warm-up" in line]
     assert [line.split(":")[1] for line in lines] == [f" {TASK} td3", f" {TASK} ddpg"]
-    assert main([*words, "--quiet"]) == 0
+    assert main([*words, "--quiet", "--runs", str(tmp_path / "quiet")]) == 0
+    assert "warm-up" not in capsys.readouterr().err
 
 
 def test_a_resumed_run_knows_its_best() -> None:

@@ -27,7 +27,7 @@ def test_a_narrow_terminal_cuts_nothing(width: int, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("COLUMNS", str(width))
     note = "training  0:00:04 elapsed  ETA 0:10:00  926.0 steps/s\nreturn 10.0  in training 1 | 2"
     with bars() as shown:
-        shown.add_task("HalfCheetah-v5 multi-td3 0", total=1_000_000, completed=20_000, note=note)
+        shown.add_task("HalfCheetah-v5 multi-td3 0", total=1_000_000, completed=20_000, below=note)
         with shown.console.capture() as captured:
             shown.console.print(shown.get_renderable())
     lines = captured.get().splitlines()

@@ -830,7 +830,7 @@ def _lines(script: Path) -> list[str]:
 def test_other_policies_of_a_run_are_collected_as_groups(tmp_path: Path) -> None:
     """Of a study of ensembles: members alone, their mean action and that of their EMA actors."""
     settings: dict[str, Any] = {**TINY, "steps": 200, "eval_every": 100, "members": 2}
-    settings |= {"rule": "none", "mean_actions": "on"}
+    settings |= {"rule": "none", "mean_actions": "on", "vary": {"gamma": [0.98, 0.99]}}
     trainer = Trainer("td3", "Pendulum-v1", runs=tmp_path / "runs", name="none", **settings)
     run_to_end(trainer)
     rows = trainer.directory.rows("eval")

@@ -80,7 +80,9 @@ def _lines(bench: Bench) -> Show:
 def _bars(bench: Bench) -> Generator[Show]:
     steps, looked = _Total(bench), 0.0
     rows: dict[str, Any] = {}  # a bar for each job that runs
-    with bars() as shown:
+    from rich.progress import TextColumn
+
+    with bars(TextColumn("{task.fields[note]}")) as shown:
         whole = shown.add_task("all runs", total=steps.read(bench)[1], note="")
 
         def show(bench: Bench) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pacesetter.cli.advice import Slowness
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
     from pacesetter.training.trainer import Report, Trainer
 
@@ -44,18 +44,19 @@ def _time(seconds: float) -> str:
     return str(timedelta(seconds=round(seconds)))
 
 
-def bars() -> "Progress":
-    """Bars on stderr, as wide as the terminal: a name, how far it is, and below it a `note`."""
+def bars(*more: "ProgressColumn") -> "Progress":
+    """Bars on stderr, as wide as the terminal: a name, how far it is, other columns, and below them
+    what a task says `below`.
+    """
     from rich.console import Console, RenderableType
     from rich.progress import BarColumn, Progress, TextColumn
     from rich.text import Text
 
     class Bars(Progress):
         def get_renderables(self) -> Iterable[RenderableType]:
-            for task in self.tasks:
-                yield self.make_tasks_table([task])
-                if task.fields["note"]:
-                    yield Text(task.fields["note"])  # wraps where the terminal is narrow
+            yield self.make_tasks_table(self.tasks)
+            # Text wraps where the terminal is narrow; a column would be cut.
+            yield from (Text(task.fields["below"]) for task in self.tasks if "below" in task.fields)
 
     columns = (
         TextColumn("{task.description}"),
@@ -63,7 +64,7 @@ def bars() -> "Progress":
         TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
     )
     console = Console(stderr=True)
-    return Bars(*columns, console=console, refresh_per_second=2, expand=True)
+    return Bars(*columns, *more, console=console, refresh_per_second=2, expand=True)
 
 
 class View:
@@ -182,11 +183,11 @@ def _bar(trainer: "Trainer", view: View) -> Generator[Any]:
     run = trainer.config.run
     with bars() as shown:
         name, step = f"{run.env} {run.name} {run.seed}", trainer.progress.step
-        task = shown.add_task(name, total=trainer.budget, completed=step, note="")
+        task = shown.add_task(name, total=trainer.budget, completed=step, below="")
 
         def look() -> None:
-            note = f"{view.phase}  {view.speed()}\n{view.returns()}"
-            shown.update(task, completed=trainer.progress.step, note=note)
+            below = f"{view.phase}  {view.speed()}\n{view.returns()}"
+            shown.update(task, completed=trainer.progress.step, below=below)
 
         def say(line: str) -> None:
             shown.console.print(line, highlight=False, markup=False)

@@ -44,8 +44,13 @@ def find(name: str, runs: str | Path = "runs") -> RunDirectory:
     if present(Path(name) / CONFIG):
         return RunDirectory(Path(name))
     parts = _plain(name).parts
-    found = _called(runs, lambda path: path.parts[-len(parts) :] == parts)
-    found = found or find_group(name, runs)
+    ends = (0, 1) if parts else ()  # with the seed, or without
+    for end in ends:
+        here = slice(-len(parts) - end, -end or None)
+        if found := _called(runs, lambda path, here=here: path.parts[here] == parts):
+            break
+    else:
+        found = []
     if len(found) == 1:
         return found[0]
     if found:

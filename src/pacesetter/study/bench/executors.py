@@ -129,7 +129,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def _claim_core(cores: list[int], slot: int) -> tuple[int, Lock]:
     """A core to which no bench of this user has pinned a run, and its lock, held.
 
-    Where all are taken, the core that the slot comes to, which is then shared.
+    Where all are taken, the core that the slot comes to, which is then shared. A killed bench holds
+    none, though its runs may go on.
     """
     own = slot % len(cores)
     folder = Path(tempfile.gettempdir()) / f"pacesetter-cores-{os.getuid()}"

@@ -124,8 +124,7 @@ def expand(
                 jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
-    again = {key: flags[key] for key in sorted(ON_RESUME & flags.keys())}
-    jobs = [job._replace(always=(*always, *_flags(again))) for job in jobs]
+    jobs = [job._replace(always=(*always, *job.always)) for job in jobs]
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
@@ -153,10 +152,11 @@ def _jobs(
     run, hyper = resolve(algorithm, env, own, {"name": name})
     usual = resolve(algorithm, env).settings()
     differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
+    again = {key: own[key] for key in sorted(ON_RESUME & own.keys())}
     for seed in seeds:
         config = Config(replace(run, seed=seed), hyper)
         words = ["train", algorithm, env, f"--seed={seed}", *_flags(differing), f"--runs={runs}"]
-        yield Job(config, RunDirectory.of(runs, config), words)
+        yield Job(config, RunDirectory.of(runs, config), words, tuple(_flags(again)))
 
 
 def _flags(settings: Settings) -> Iterable[str]:

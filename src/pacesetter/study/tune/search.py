@@ -158,6 +158,7 @@ class Tuning:
                 pruned = self._train(trial, trainer, sink)
         except (TrainingError, UsageError, MemoryError) as error:
             self._tell(trial, FAILED, None, str(error) or "out of memory")
+            self._trainer = None  # with its networks, whose memory the next trial may need
             if not (directory := self._directory_of(trial)).in_use():
                 directory.remove_checkpoint()
             return
