@@ -17,6 +17,7 @@ from pacesetter.process import (
     exit_code,
     fix_threads,
     forget_jax_settings,
+    multiplies_bfloat16,
     stopping,
     threads,
 )
@@ -212,3 +213,18 @@ def test_a_run_records_a_command_that_can_be_called(monkeypatch: pytest.MonkeyPa
     for program in ("/venv/bin/pacesetter", "/src/pacesetter/__main__.py"):
         monkeypatch.setattr(sys, "argv", [program, "train", "td3", "Ant-v5"])
         assert provenance()["command"] == "pacesetter train td3 Ant-v5"
+
+
+@pytest.mark.parametrize(
+    ("flags", "has"), [("fpu avx2 avx512_bf16", True), ("fpu avx2", False), (None, False)]
+)
+def test_who_multiplies_bfloat16(
+    flags: str | None, has: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(path: Path, encoding: str) -> str:
+        if flags is None:
+            raise FileNotFoundError
+        return f"processor\t: 0\nflags\t\t: {flags}\n"
+
+    monkeypatch.setattr(Path, "read_text", read)
+    assert multiplies_bfloat16() == has

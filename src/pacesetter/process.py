@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -121,6 +122,15 @@ def is_signal(error: BaseException) -> bool:
 def on_signals(handler: Handler) -> None:
     """Let this handler have every signal that asks for the end."""
     _install(dict.fromkeys(CODES, handler))
+
+
+def multiplies_bfloat16() -> bool:
+    """Whether this processor has instructions for products of bfloat16, as Linux tells it."""
+    try:
+        words = Path("/proc/cpuinfo").read_text("utf-8").split()
+    except OSError:
+        return False
+    return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(words)
 
 
 def _install(handlers: dict[int, Any]) -> dict[int, Any]:
