@@ -90,3 +90,11 @@ def test_what_is_near_is_not_called_allowed(capsys: pytest.CaptureFixture[str]) 
         line = capsys.readouterr().err
         assert said in line
         assert "allowed" not in line
+
+
+@pytest.mark.parametrize("name", [".", "*", "td*", "Ant-v5/*"])
+def test_a_pattern_or_a_folder_is_no_run(name: str, runs: Path) -> None:
+    """Even where it would fit one run only: `resume` must not guess."""
+    made(runs, "Ant-v5", "td3")
+    with pytest.raises(UsageError, match="not found"):
+        find(name, runs)
