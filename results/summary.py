@@ -70,8 +70,10 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
         if run is None or not (run.finished or unfinished):
             print(f"left out as unfinished: {each.path}", file=sys.stderr)
             continue
-        for one in [line, *(apart(each, line) if study in APART else ())]:
-            read(str(each.path), one)
+        others = [*apart(each, line)] if study in APART else []
+        for one in others:
+            read(str(each.path), one)  # which refuses what compare could not read
+        for one in [line, *others]:
             if new.setdefault(_key(one), one) is not one:
                 sys.exit(f"{each.path}: a run of the same task, name and seed is in {folders} too")
     table = {_key(line): line for line in old} | new

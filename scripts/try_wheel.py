@@ -32,7 +32,8 @@ COMMANDS = (
 def interpreter(version: str) -> str | None:
     """The newest Python of a minor version: from PATH, else from pyenv."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-    kept = sorted(pyenv.glob(f"versions/{version}.*/bin/python"), key=numbers)
+    every = pyenv.glob(f"versions/{version}.*/bin/python")
+    kept = sorted((path for path in every if re.fullmatch(r"[\d.]+", path.parts[-3])), key=numbers)
     found = [shutil.which(f"python{version}"), *map(str, reversed(kept))]
     return next((path for path in found if path and answers(path, version)), None)
 

@@ -277,4 +277,5 @@ def test_score_in_the_file(runs: Path) -> None:
     assert "bias" in best["score_note"]
     assert "score_note" not in about
     observation = np.float32([0.1, -0.2, 0.3])
-    assert np.array_equal(load(directory.policy_file)(observation), trainer.policy()(observation))
+    for path in (directory.policy_file, directory.path, str(directory.path)):
+        assert np.array_equal(load(path)(observation), trainer.policy()(observation))

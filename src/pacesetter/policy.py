@@ -145,8 +145,9 @@ def file_of(name: str | Path) -> Path | None:
 
 
 def load(path: str | Path) -> Policy:
-    """The policy of a file, or `champion:NAME`; nothing in the file is executed or imported."""
+    """The policy of a file, of a run's folder, or `champion:NAME`; nothing in it is executed."""
     path = file_of(path) or Path(path)
+    path = path / "policy.safetensors" if path.is_dir() else path
     # A person, or the hub's cache, may name a link.
     arrays, table = storage.read(path.resolve() if path.is_symlink() else path, KIND)
     if table.get("schema") != SCHEMA:

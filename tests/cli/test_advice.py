@@ -44,7 +44,7 @@ class Clockwork:
     def __init__(self, name: str, speed: float, **settings: Any) -> None:
         self.config = resolve(name, TASK, settings)
         self.budget, self.speed = self.config.budget, speed
-        self.progress: Any = SimpleNamespace(step=5_000, updates=0)
+        self.progress: Any = SimpleNamespace(step=5_000, updates=0, wall_seconds=0.0)
 
     def lines(self, seconds: int) -> list[str]:
         slow, said = Slowness(self), []  # pyright: ignore
@@ -87,6 +87,11 @@ def test_a_limit_of_time_does_not_make_slow_settings_bearable() -> None:
     assert "and --time ends it after 30 minutes" in line
     assert "such as --time" not in line
     assert Clockwork("crossq", 0.3, time="5m").lines(200) == [], "five minutes are borne"
+    resumed = Clockwork("crossq", 0.3, time="8h")
+    resumed.progress.wall_seconds = 7.5 * 3600
+    assert "--time ends it after 30 minutes" in resumed.lines(200)[0], "what was spent counts"
+    resumed.progress.wall_seconds = 7.95 * 3600
+    assert resumed.lines(200) == [], "three minutes are borne"
 
 
 def test_bench_says_it_of_each_entry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

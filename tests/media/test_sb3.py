@@ -134,6 +134,24 @@ def test_script_makes_the_task_that_was_asked_for(pendulum: Policy, tmp_path: Pa
     )
 
 
+def test_script_with_an_infinite_keyword_runs(
+    pendulum: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "pendulum.py"
+    export(pendulum, "sb3", path, env="Pendulum-v1", env_kwargs={"g": float("inf")})
+    made: list[Any] = []
+
+    def make(recipe: Recipe) -> Any:
+        made.append(recipe.kwargs)
+        return gymnasium.make("Pendulum-v1", g=9.0, max_episode_steps=10)
+
+    monkeypatch.setattr(Recipe, "make", make)
+    if not _has_sb3():
+        _stand_in(monkeypatch)
+    runpy.run_path(str(path), run_name="__main__")
+    assert made == [{"g": float("inf")}]
+
+
 @pytest.mark.parametrize("env", ["odd_envs:Goal-v0", "pacesetter/Ant111-v4"])
 def test_script_makes_tasks_that_gymnasium_alone_would_not(tmp_path: Path, env: str) -> None:
     """One with Dict observations, and one of pacesetter's own, in a process of its own."""

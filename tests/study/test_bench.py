@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import platform
 import re
 import signal
 import stat
@@ -420,7 +421,8 @@ def test_locked_run_is_left_to_its_holder(jobs: list[Job]) -> None:
     for _ in range(5):
         next(steps)
     assert (executor.calls, work.finished) == (["train"], jobs[1:])
-    assert sum("in use by another process; will retry" in line for line in work.news) == 1
+    waiting = f"in use by process {os.getpid()} on {platform.node()}; will retry"
+    assert sum(waiting in line for line in work.news) == 1
     holder.unlock()
     for _ in steps:
         pass
@@ -445,6 +447,45 @@ def test_run_of_another_machine_is_not_failed(
         pass
     assert (len(work.finished), work.failed) == (2, {})
     assert any("process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
+
+
+def test_own_run_that_died_on_another_machine_is_tried_again(
+    jobs: list[Job], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The text of its lock stays, and this bench has seen it end: no reason to wait for ever."""
+
+    def no_locks(*arguments: Any) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    lock = jobs[0].directory.path / "lock"
+
+    def killed(words: list[str]) -> int:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        lock.write_text("process 1 on elsewhere\n")
+        return -9
+
+    work = run(jobs[:1], executor := Here(killed, main, main))
+    assert len(executor.calls) == RETRIES + 1
+    assert work.failed == {str(jobs[0]): "exit 75: the fault"}
+
+
+def test_a_quiet_bench_names_the_run_that_it_waits_for(
+    jobs: list[Job], capsys: pytest.CaptureFixture[str]
+) -> None:
+    jobs[0].directory.state_file.parent.mkdir(parents=True)
+    jobs[0].directory.lock()
+    work = Bench(jobs[:1])
+    with bench_progress.display(work, quiet=True) as show:
+        steps = work.run(Here())
+        for _ in range(3):
+            next(steps)
+            show(work)
+        jobs[0].directory.unlock()
+        for _ in steps:
+            show(work)
+    said = f"pacesetter: {jobs[0]}: in use by process {os.getpid()} on {platform.node()}\n"
+    assert capsys.readouterr().err.count(said) == 1
 
 
 def test_run_that_another_was_quicker_with(jobs: list[Job]) -> None:
@@ -563,7 +604,7 @@ def test_run_of_other_settings_is_refused(
 
 
 def test_settings_without_a_result_stop_no_study(jobs: list[Job]) -> None:
-    """A run that goes on takes those of them that `resume` takes."""
+    """A run that goes on takes them anew."""
     run(jobs[1:], Here())
     flags = {"env_timeout": "30s", "checkpoint_every": 9.0, "device": "cpu"}
     again = expand(load("suite.toml"), flags, "runs")
@@ -572,7 +613,7 @@ def test_settings_without_a_result_stop_no_study(jobs: list[Job]) -> None:
     words = bench_module.words_of(again[1])
     assert words[0] == "resume"
     assert {"--env-timeout=30s", "--checkpoint-every=9.0"} < {*words}
-    assert not any("device" in word for word in words)
+    assert "--device=cpu" in words
 
 
 def test_stop_waits_for_all_and_starts_none(jobs: list[Job]) -> None:

@@ -77,6 +77,23 @@ def test_what_is_not_known_is_not_ranked(tmp_path: Path) -> None:
     assert "inf" not in line
 
 
+def test_a_control_that_made_no_update_is_still_among_the_runs(tmp_path: Path) -> None:
+    for env in ("Ant-v5", "Walker2d-v5"):
+        runs(tmp_path, {"td3": 9_000, "sac": 1_000, "ddpg": 500}, 3, env)
+    for path in tmp_path.glob("*/*/*/metrics.jsonl"):
+        if path.parts[-3] != "td3":
+            path.write_text(path.read_text().replace('"updates": 0', '"updates": 9'))
+    line = headline(compare([tmp_path], budget="20k"))
+    assert "sac on 2; td3 has no known return, so no difference is tested." in line
+    (tmp_path / "alone").mkdir()
+    for env in ("Ant-v5", "Walker2d-v5"):
+        for name in ("td3", "sac"):
+            (tmp_path / env / name).rename(tmp_path / "alone" / f"{env}-{name}")
+    line = headline(compare([tmp_path / "alone"], budget="20k"))
+    assert line.startswith("sac was run on 2 tasks, beside none whose return is known.")
+    assert "td3 on Ant-v5, td3 on Walker2d-v5." in line
+
+
 def test_who_made_no_update_is_not_ahead(tmp_path: Path) -> None:
     """Its warm-up is longer than the budget, and what it scores is luck."""
     runs(tmp_path, {"td3": 9_000, "sac": 1_000}, 5)

@@ -21,7 +21,7 @@ from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.results import compact
-from pacesetter.study.report import films, intervals
+from pacesetter.study.report import figures, films, intervals
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +215,29 @@ def test_a_chart_is_read_by_mouse_and_by_keyboard(opened: Any) -> None:
     assert "env steps, all members 2500" in values.text
     outline = "return getComputedStyle(arguments[0]).outlineStyle"
     assert opened.execute_script(outline, chart) == "solid"
+
+
+def test_the_interval_of_two_seeds_does_not_flatten_the_curves(
+    browser: Any, tmp_path: Path
+) -> None:
+    """Student's t with one degree of freedom is 12.7; of its band the means' height is shown."""
+    for seed, level in enumerate((1_000.0, 3_000.0)):
+        make_run(tmp_path, "Ant-v5", "td3", seed, level=level, budget=100_000, evaluations=20)
+    found = compare([tmp_path])
+    panel = figures.page(found, "steps").axes[0]
+    (line,) = panel.lines
+    means, (low, high) = line.get_ydata(), panel.get_ylim()
+    height = means.max() - means.min()
+    assert stats.mean(np.array([1_000.0, 3_000.0])).high > means.max() + 2 * height
+    assert low >= means.min() - height
+    assert high == pytest.approx(means.max() + height)
+    write(tmp_path / "report.html", tmp_path, "--no-film")
+    browser.get((tmp_path / "report.html").as_uri())
+    script = "return document.querySelector('figure.chart path[fill-opacity]').getBBox()"
+    band = browser.execute_script(script)
+    svg = browser.execute_script("return document.querySelector('figure.chart svg').clientHeight")
+    assert band["y"] > 0
+    assert band["y"] + band["height"] < svg - 20
 
 
 def test_every_control_is_reached_by_tab(opened: Any) -> None:

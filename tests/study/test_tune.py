@@ -351,6 +351,22 @@ def test_each_study_has_its_own_best_settings() -> None:
     assert best == ["sweep.1.best.toml", "sweep.2.best.toml", "sweep.best.toml"]
 
 
+def test_two_studies_do_not_share_their_best_settings() -> None:
+    """`sweep` and `sweep.log` would both write sweep.best.toml."""
+    study(file="sweep.log")
+    with pytest.raises(UsageError, match=r"sweep.log has the same best.toml; give another --study"):
+        study(file="sweep")
+    study(file="other")
+    with pytest.raises(UsageError, match="other has the same"):
+        study(file="other.log")
+
+
+@pytest.mark.parametrize("value", [None, [None], {"a": [1, None]}])
+def test_a_keyword_that_toml_cannot_hold_is_refused_before_the_study(value: Any) -> None:
+    with pytest.raises(UsageError, match="keyword of none"):
+        study(env_kwargs={"k": value})
+
+
 # Bad input.
 
 BAD = {

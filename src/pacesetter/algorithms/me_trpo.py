@@ -27,7 +27,7 @@ from pacesetter.dynamics.model import DETERMINISTIC, GAUSSIAN, Dynamics, Known, 
 from pacesetter.networks.trust_region import Gaussian, distribution_of
 from pacesetter.policy import OBSERVATION_LIMIT, Actors
 from pacesetter.settings import STRICT, ModelDriven, only
-from pacesetter.settings.values import LARGEST_COUNTED, Count, Width
+from pacesetter.settings.values import LARGEST_COUNTED, Count, SmallCount, SmallCountOr0, Width
 from pacesetter.types import Floats
 
 
@@ -53,17 +53,13 @@ class Hyper(ModelDriven, trpo.Hyper):
     model_noise: bool = Field(
         False, description="models learn a deviation too, of which imagined steps draw"
     )
-    model_batch_size: int = Field(
-        1000, ge=1, le=1_000_000, description="rows in a model's minibatch"
-    )
-    model_patience: int = Field(
-        5, ge=1, le=1_000_000, description="passes without a fall that end a fit"
-    )
+    model_batch_size: SmallCount = Field(1000, description="rows in a model's minibatch")
+    model_patience: SmallCount = Field(5, description="passes without a fall that end a fit")
     model_rows: Count = Field(
         250_000, ge=1, le=LARGEST_COUNTED, description="rows that a fit goes through at most"
     )
-    renew_every: int = Field(
-        0, ge=0, le=1_000_000, description="iterations from new networks to new; 0: never"
+    renew_every: SmallCountOr0 = Field(
+        0, description="iterations from new networks to new; 0: never"
     )
     imagined_steps: Count = Field(
         20_000,
@@ -75,22 +71,12 @@ class Hyper(ModelDriven, trpo.Hyper):
         1000, ge=1, validate_default=True, description="longest imagined episode"
     )
     bootstrap: bool = Field(True, description="the critic's value counts at the horizon")
-    policy_updates: int = Field(
-        50, ge=1, le=1_000_000, description="policy updates of an iteration at most"
-    )
-    check_every: int = Field(
-        5, ge=1, le=1_000_000, description="policy updates between checks in all models"
-    )
-    patience: int = Field(
-        25, ge=1, le=1_000_000, description="policy updates without a kept policy that end it"
-    )
+    policy_updates: SmallCount = Field(50, description="policy updates of an iteration at most")
+    check_every: SmallCount = Field(5, description="policy updates between checks in all models")
+    patience: SmallCount = Field(25, description="policy updates without a kept policy that end it")
     share: float = Field(0.7, ge=0, le=1, description="share of models that must not see a fall")
-    critic_epochs: int = Field(
-        5, ge=0, le=1_000_000, description="passes of the critic over imagined steps"
-    )
-    critic_batch_size: int = Field(
-        1000, ge=1, le=1_000_000, description="observations in its minibatches"
-    )
+    critic_epochs: SmallCountOr0 = Field(5, description="passes of the critic over imagined steps")
+    critic_batch_size: SmallCount = Field(1000, description="observations in its minibatches")
 
 
 class State(NamedTuple):

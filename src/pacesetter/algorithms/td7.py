@@ -30,7 +30,7 @@ from pacesetter.errors import UsageError
 from pacesetter.networks import critic_heads, mlp, sale
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
-from pacesetter.settings.values import LearningRate, Width
+from pacesetter.settings.values import LearningRate, SmallCount, Width
 
 FAR = 1e8  # beyond every target: where the smallest and largest one seen begin
 
@@ -63,9 +63,7 @@ class Hyper(OffPolicy):
     )
     critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
     policy_delay: int = Field(2, ge=1, le=1_000, description="critic updates per actor update")
-    copy_every: int = Field(
-        250, ge=1, le=1_000_000, description="critic updates between copies to the targets"
-    )
+    copy_every: SmallCount = Field(250, description="critic updates between copies to the targets")
     target_noise: float = Field(
         0.2, ge=0, description="standard deviation of the target action's noise"
     )

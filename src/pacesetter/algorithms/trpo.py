@@ -35,7 +35,7 @@ from pacesetter.networks.trust_region import (
 )
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OnPolicy
-from pacesetter.settings.values import Width
+from pacesetter.settings.values import SmallCount, SmallCountOr0, Width
 from pacesetter.types import Floats
 
 
@@ -54,12 +54,8 @@ class Hyper(OnPolicy):
     backtracks: int = Field(10, ge=1, le=1_000, description="lengths that the line search tries")
     backtrack_ratio: float = Field(0.8, gt=0, lt=1, description="each length by the one before")
     critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critic")
-    critic_epochs: int = Field(
-        20, ge=0, le=1_000_000, description="passes of the critic over a rollout"
-    )
-    critic_batch_size: int = Field(
-        128, ge=1, le=1_000_000, description="observations in its minibatches"
-    )
+    critic_epochs: SmallCountOr0 = Field(20, description="passes of the critic over a rollout")
+    critic_batch_size: SmallCount = Field(128, description="observations in its minibatches")
 
 
 class State(NamedTuple):

@@ -59,9 +59,9 @@ class Slowness:
             return None
         self._over = True
         speed = made / seconds
-        left, limit = self._left() / speed, self._trainer.config.run.time
+        left, limit = self._left() / speed, self._limit()
         bearable = SOON if speed < SLOW else LONG
-        return self._line(speed, left) if min(left, limit or inf) > bearable else None
+        return self._line(speed, left, limit) if min(left, limit) > bearable else None
 
     def _left(self) -> float:
         """Critic updates that the budget still asks for."""
@@ -69,9 +69,13 @@ class Slowness:
         steps = self._trainer.budget - max(self._trainer.progress.step, hyper.warmup)
         return steps * hyper.updates_per_step
 
-    def _line(self, speed: float, seconds: float) -> str:
+    def _limit(self) -> float:
+        """Seconds that --time leaves, of which a resumed run has spent some."""
         limit = self._trainer.config.run.time
-        cut = f", and --time ends it after {_long(limit)}" if limit and limit < seconds else ""
+        return inf if limit is None else max(limit - self._trainer.progress.wall_seconds, 0)
+
+    def _line(self, speed: float, seconds: float, limit: float) -> str:
+        cut = f", and --time ends it after {_long(limit)}" if limit < seconds else ""
         return (
             f"at {speed:.2g} updates per second this run takes about {_long(seconds)} on this "
             f"machine{cut}; {_remedy(self._trainer.config)}; Ctrl-C saves"

@@ -29,12 +29,24 @@ LINE_EVERY = 300.0  # seconds between lines that say how far all is
 def display(bench: Bench, quiet: bool = False) -> Generator[Show]:
     """What shows how far a bench is, each time it is called with it."""
     if quiet:
-        yield lambda bench: None
+        yield _waits()
     elif sys.stderr.isatty():
         with _bars(bench) as show:
             yield show
     else:
         yield _lines(bench)
+
+
+def _waits() -> Show:
+    """Name only the runs that wait for another process, without which a bench may not end."""
+    told: set[str] = set()
+
+    def show(bench: Bench) -> None:
+        for name in bench.aside.keys() - told:
+            told.add(name)
+            print(f"pacesetter: {name}: in use by {bench.aside[name]}", file=sys.stderr, flush=True)
+
+    return show
 
 
 class _Total:

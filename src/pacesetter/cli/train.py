@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 from pacesetter import consent
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
@@ -86,6 +86,7 @@ def _add_settings(command: Any, algorithm: str, env: str) -> None:
 
 def _resumed_trainer(words: list[str]) -> Command:
     """The old run of `resume WORDS`."""
+    from pacesetter.config import Run
     from pacesetter.runs import find
 
     command = parser(
@@ -101,6 +102,8 @@ def _resumed_trainer(words: list[str]) -> Command:
     limit = "new limit of a task's step, reset or making, such as 30s"
     add("--env-timeout", metavar="T", help=limit)
     add("--checkpoint-every", metavar="T", help="new time between checkpoints, such as 5m")
+    devices = get_args(fields_of(Run)["device"].annotation)
+    add("--device", choices=devices, help="new device to learn on")
     command.add_allow()
     command.add_runs()
     command.add_log()
@@ -112,7 +115,7 @@ def _resumed_trainer(words: list[str]) -> Command:
     from pacesetter.training.trainer import Trainer
 
     budgets = ("steps", "time", "stop_at", "stop_patience")
-    names = (*budgets, "env_timeout", "checkpoint_every", "allow")
+    names = (*budgets, "env_timeout", "checkpoint_every", "device", "allow")
     given = {name: getattr(found, name) for name in names}
     with aside():
         trainer = Trainer.resume(directory.path, runs=found.runs, **given)

@@ -13,7 +13,7 @@ from pacesetter.policy import Floats, Policy
 
 SCRIPT = '''"""`model` is a policy as Stable-Baselines3 expects one; run it to evaluate."""
 
-from pathlib import Path
+{imports}from pathlib import Path
 
 from pacesetter import load
 from pacesetter.media.sb3 import SB3Policy
@@ -81,7 +81,9 @@ def to_sb3(
     given = [task.name, task.kwargs, task.wrap]
     while not given[-1]:
         given.pop()
-    text = SCRIPT.format(task=", ".join(map(repr, given)))
+    words = ", ".join(map(repr, given))
+    imports = "from math import inf\n" if "inf" in words else ""  # as `repr` writes Infinity
+    text = SCRIPT.format(task=words, imports=imports)
     try:
         policy.save(file)
         write_atomically(path, text.encode())

@@ -2,7 +2,6 @@
 
 from pacesetter.runs.directory import (
     FREE_PER_SEED,
-    ON_RESUME,
     SCHEMA,
     WITHOUT_RESULT,
     RunDirectory,
@@ -12,7 +11,6 @@ from pacesetter.runs.log import Row
 
 __all__ = [
     "FREE_PER_SEED",
-    "ON_RESUME",
     "SCHEMA",
     "WITHOUT_RESULT",
     "Row",

@@ -28,8 +28,8 @@ from pacesetter.runs.records import SCHEMA, check_record
 from pacesetter.settings.validation import difference
 
 CONFIG = "config.json"
-WITHOUT_RESULT = {"checkpoint_every", "device", "env_timeout"}  # settings that change none
-ON_RESUME = {"checkpoint_every", "env_timeout"}  # those of them that `resume` takes anew
+# Settings that change no result, which `resume` takes anew.
+WITHOUT_RESULT = {"checkpoint_every", "device", "env_timeout"}
 # Settings in which the seeds of one name may differ.
 HORIZONS = {"replay_horizon", "lr_horizon"}
 FREE_PER_SEED = {"seed", "steps", "time"} | WITHOUT_RESULT | HORIZONS
@@ -253,6 +253,6 @@ class RunDirectory:
         """Whether a process holds the folder now."""
         return self._lock.is_held()
 
-    def holder(self) -> str | None:
-        """Who holds the folder now, for people; None if nobody does."""
-        return self._lock.holder()
+    def holder(self, doubtful: bool = True) -> str | None:
+        """Who holds the folder now, as `Lock.holder` tells."""
+        return self._lock.holder(doubtful)

@@ -72,21 +72,32 @@ class Lock:
             self._file = None
 
     def is_held(self) -> bool:
-        """Whether a process holds the file now; False if that cannot be told."""
+        """Whether a process holds the file now, or may, as `holder` says."""
         return self.holder() is not None
 
-    def holder(self) -> str | None:
-        """Who holds the file now, for people; None if nobody does or that cannot be told."""
+    def holder(self, doubtful: bool = True) -> str | None:
+        """Who holds the file now, for people; None if nobody does or it cannot be read.
+
+        Of a process of another machine, on a file system without locks, nobody here can tell
+        whether it lives; it counts only if `doubtful`.
+        """
         try:
             with _open(self.path, "r") as file:
                 if _flock(file, fcntl.LOCK_SH):
                     return None
                 text = _text(file)
-                return text if _lives(text) else self._elsewhere(text)
+                return text if _lives(text) else self._elsewhere(text) if doubtful else None
         except BlockingIOError:
-            return "another process"
+            return self._named()
         except OSError:
             return None
+
+    def _named(self) -> str:
+        """Who holds the file, by its text."""
+        with suppress(OSError), _open(self.path, "r") as file:
+            if text := _text(file):
+                return text
+        return "another process"
 
     def _refuse_holder(self, file: IO[str]) -> None:
         text = _text(file)

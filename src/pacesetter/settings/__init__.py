@@ -9,6 +9,7 @@ from pacesetter.settings.values import (
     Count,
     LearningRate,
     Numbers,
+    SmallCount,
     Switch,
     Tau,
     Tune,
@@ -96,8 +97,8 @@ class Hyper:
 class OffPolicy(Hyper):
     """Settings of every off-policy algorithm, which learns from a replay."""
 
-    batch_size: Annotated[int, Tune(64, 512, log=True)] = Field(
-        256, ge=1, le=1_000_000, description="transitions per minibatch"
+    batch_size: Annotated[SmallCount, Tune(64, 512, log=True)] = Field(
+        256, description="transitions per minibatch"
     )
     replay_size: Count = Field(1_000_000, ge=1, description=REPLAY_SIZE)
     replay: Literal["uniform", "prioritized", "lap", "return"] = Field(

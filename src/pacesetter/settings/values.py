@@ -85,6 +85,8 @@ class Tune(NamedTuple):
 
 
 Width = Annotated[int, Field(ge=1, le=16_384)]
+SmallCount = Annotated[int, Field(ge=1, le=1_000_000)]
+SmallCountOr0 = Annotated[int, Field(ge=0, le=1_000_000)]
 LARGEST_COUNTED = 2**31 - 1  # what a learner's program compares with one of its counters
 Count = Annotated[int, BeforeValidator(_count)]
 Numbers = Annotated[str, AfterValidator(_numbers)]

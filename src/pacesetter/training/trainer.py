@@ -90,10 +90,11 @@ class Trainer:
         stop_patience: int | None = None,
         env_timeout: float | str | None = None,
         checkpoint_every: float | str | None = None,
+        device: str | None = None,
         allow: Iterable[str] = (),
         env: Factory | None = None,
     ) -> Self:
-        """Take up a run where its last checkpoint left it, with a new budget or times if given.
+        """Take up a run where its last checkpoint left it, with what is given anew.
 
         `allow` are names in its config that may import a module; `env` is the function that made
         its envs, if one did.
@@ -108,6 +109,7 @@ class Trainer:
             stop_patience=stop_patience,
             env_timeout=env_timeout,
             checkpoint_every=checkpoint_every,
+            device=device,
         )
         identity.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from pacesetter.config import Config, full_id, merge, resolve
 from pacesetter.consent import require, require_all
 from pacesetter.errors import UsageError, unknown
-from pacesetter.runs import ON_RESUME, RunDirectory
+from pacesetter.runs import WITHOUT_RESULT, RunDirectory
 from pacesetter.settings import Settings
 from pacesetter.settings.files import read_file
 
@@ -152,7 +152,7 @@ def _jobs(
     run, hyper = resolve(algorithm, env, own, {"name": name})
     usual = resolve(algorithm, env).settings()
     differing = {k: v for k, v in Config(run, hyper).settings().items() if v != usual[k]}
-    again = {key: own[key] for key in sorted(ON_RESUME & own.keys())}
+    again = {k: own[k] for k in sorted(WITHOUT_RESULT & own.keys()) if own[k] is not None}
     for seed in seeds:
         config = Config(replace(run, seed=seed), hyper)
         words = ["train", algorithm, env, f"--seed={seed}", *_flags(differing), f"--runs={runs}"]

@@ -67,12 +67,12 @@ def _figure(rows: int, columns: int) -> tuple[Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    width, height, wide, high = 3.4, 2.4, 0.85, 0.9
+    width, height, wide, high = 3.4, 2.4, 0.95, 0.9
     size = (columns * (width + wide) + 0.2, rows * (height + high) + 0.4)
     figure = Figure(figsize=size)
     FigureCanvasAgg(figure)
     figure.subplots_adjust(
-        left=0.8 / size[0],
+        left=0.9 / size[0],
         right=1 - 0.2 / size[0],
         bottom=0.55 / size[1],
         top=1 - 0.75 / size[1],
@@ -106,6 +106,7 @@ def _curves(panel: Any, comparison: Comparison, env: str, axis: str, window: int
         label = f"{group.name} (n={len(group.runs)})"
         _draw(panel, curve(group, axis, window), styles[group.name], label)
     _label(panel, env, AXES[axis], "return")
+    _fit(panel)
     panel.legend(frameon=False, fontsize="small")
 
 
@@ -176,6 +177,7 @@ def figure_2(comparison: Comparison, window: int | None = None) -> Any:
             label = f"{group.name} ({split(group.env)[1]}, n={len(group.runs)})"
             _draw(panel, line, styles[group.name], label)
         _label(panel, f"{task}, {' and '.join(pair)}", f"env steps to {steps(end)}", "return")
+        _fit(panel)
         panel.legend(frameon=False, fontsize="small")
     _head(
         figure,
@@ -230,6 +232,17 @@ def _draw(panel: Any, line: Curve, style: tuple[str, str], label: str) -> None:
     )
     if np.isfinite(line.low).any():
         panel.fill_between(line.x, line.low, line.high, color=colour, alpha=0.18, linewidth=0)
+
+
+def _fit(panel: Any) -> None:
+    """Show the means whole, and of the intervals no more than that height again on each side.
+
+    That of two seeds can be ten times as wide as everything else.
+    """
+    means = np.concatenate([line.get_ydata() for line in panel.lines])
+    low, high = panel.get_ylim()
+    height = np.ptp(means) or 1.0
+    panel.set_ylim(max(low, means.min() - height), min(high, means.max() + height))
 
 
 def _label(panel: Any, title: str, x: str, y: str) -> None:

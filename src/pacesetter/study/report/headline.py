@@ -22,7 +22,9 @@ def headline(comparison: Comparison) -> str:
     unknown = [f"{x.name} on {x.env}" for x in comparison.groups if x not in known]
     more = f"; and {len(unknown) - MOST} more" if len(unknown) > MOST else ""
     rest = f" Not known, without an evaluation after the first update: {', '.join(unknown[:MOST])}"
-    return _sentence(replace(comparison, groups=known)) + (f"{rest}{more}." if unknown else "")
+    names = {group.name for group in comparison.groups}
+    sentence = _sentence(replace(comparison, groups=known), names)
+    return f"{sentence}{rest}{more}." if unknown else sentence
 
 
 def _is_known(group: Group, metric: str) -> bool:
@@ -31,12 +33,13 @@ def _is_known(group: Group, metric: str) -> bool:
     return learned and bool(np.isfinite(group.values(metric)).all())
 
 
-def _sentence(comparison: Comparison) -> str:
+def _sentence(comparison: Comparison, names: set[str]) -> str:
+    """Of the groups that are known; `names` are those of all algorithms."""
     if len(comparison.groups) == 1:
         return _alone(comparison.groups[0], comparison.metric)
     if len(comparison.envs) == 1:
         return _best(comparison)
-    return _tally(comparison) or _leaders(comparison)
+    return _tally(comparison) or _leaders(comparison, names)
 
 
 def _alone(group: Group, metric: str) -> str:
@@ -105,19 +108,25 @@ def _places(counts: list[int]) -> str:
     return " and ".join(found)
 
 
-def _leaders(comparison: Comparison) -> str:
+def _leaders(comparison: Comparison, every: set[str]) -> str:
     """How many tasks each algorithm leads, where no task has the control beside another."""
     metric, led = comparison.metric, dict[str, int]()
     names = {group.name for group in comparison.groups}
     if len(names) == 1:
-        return f"{names.pop()} was run on {len(comparison.envs)} tasks, beside no other algorithm."
+        beside = "no other algorithm" if len(every) == 1 else "none whose return is known"
+        return f"{names.pop()} was run on {len(comparison.envs)} tasks, beside {beside}."
     for env in comparison.envs:
         groups = [group for group in comparison.groups if group.env == env]
         name = max(groups, key=lambda group: _mean(group, metric)).name
         led[name] = led.get(name, 0) + 1
     ranked = sorted(led.items(), key=lambda item: -item[1])[:MOST]
     words = ", ".join(f"{name} on {count}" for name, count in ranked)
-    beside = "was run beside no other" if comparison.reference in names else "is not among the runs"
+    if comparison.reference in names:
+        beside = "was run beside no other"
+    elif comparison.reference in every:
+        beside = "has no known return"
+    else:
+        beside = "is not among the runs"
     return (
         f"The highest {NAMES[metric].lower()} of {len(comparison.envs)} tasks: {words}; "
         f"{comparison.reference} {beside}, so no difference is tested."

@@ -114,9 +114,13 @@ class Chart {
     const single = seeds ? this.lines.flatMap(([name]) => (spec.seeds[name] || [])
       .map((seed) => [name, seed[this.axis], seed.y])) : [];
     const xs = this.lines.flatMap(([, line]) => line[0]).concat(single.flatMap((one) => one[1]));
-    const ys = this.lines.flatMap(([, line]) => [...line[1], ...line[2], ...line[3]]);
+    const means = this.lines.flatMap(([, line]) => line[1])
+      .concat(single.flatMap((one) => one[2]));
+    const bands = this.lines.flatMap(([, line]) => [...line[2], ...line[3]]);
     [this.low, this.high] = extent(xs);
-    const [bottom, top] = extent(ys.concat(single.flatMap((one) => one[2])));
+    // The interval of two seeds can be ten times as wide as all else: no more than its height again.
+    const [least, most] = extent(means), [lowest, highest] = extent(means.concat(bands));
+    const bottom = Math.max(lowest, 2 * least - most), top = Math.min(highest, 2 * most - least);
     const pad = (top - bottom) * 0.04;
     this.x = (at) => LEFT + (at - this.low) / (this.high - this.low) * (this.width - LEFT - RIGHT);
     this.y = (at) => TOP + (top + pad - at) / (top - bottom + 2 * pad) * (HEIGHT - TOP - BOTTOM);
@@ -165,8 +169,9 @@ class Chart {
 
   band(name, [xs, , low, high]) {
     if (low.some((value) => value === null)) return;
-    const there = path(xs, high, this.x, this.y);
-    const back = path([...xs].reverse(), [...low].reverse(), this.x, this.y);
+    const y = (at) => Math.min(Math.max(this.y(at), TOP), HEIGHT - BOTTOM);
+    const there = path(xs, high, this.x, y);
+    const back = path([...xs].reverse(), [...low].reverse(), this.x, y);
     element("path", { d: `${there}L${back.slice(1)}Z`, fill: data.styles[name][0],
       "fill-opacity": 0.16 }, this.svg);
   }

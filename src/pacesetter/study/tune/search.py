@@ -20,7 +20,7 @@ from pacesetter import algorithms
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
 from pacesetter.files import make_folder, present, sync_folder, write_atomically
-from pacesetter.runs import ON_RESUME, Row, RunDirectory, find_all
+from pacesetter.runs import WITHOUT_RESULT, Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
 from pacesetter.settings import Settings
 from pacesetter.study.bench.suite import TUNING_SEEDS
@@ -81,13 +81,17 @@ class Tuning:
         for key in ("seed", "name"):
             if key in self.fixed:
                 raise UsageError(f"{key}: each trial sets its own; seeds start at {TUNING_SEEDS}")
-        if None in self.fixed.get("env_kwargs", {}).values():
+        if _holds_none(self.fixed.get("env_kwargs", {})):
             raise UsageError("env: a keyword of none cannot be kept in a file of settings (TOML)")
         if not self.ranges:
             raise UsageError("tune: no setting is left to search; all are fixed or have no range")
         if not self.file.name or self.file.is_dir():
             raise UsageError(f"study: {self.file} is a folder; name a file, such as tune.log")
         refuse_foreign(self.file)
+        stem = self.file.name.removesuffix(".log")
+        twin = stem if stem != self.file.name else f"{stem}.log"
+        if twin and self.file.with_name(twin).is_file():
+            raise UsageError(f"study: {twin} has the same best.toml; give another --study")
         if not self.file.exists() and any(find_all(self.runs)):
             raise UsageError(
                 f"study: {self.file} is gone, but {self.runs} has its trials; move them away, or "
@@ -198,7 +202,7 @@ class Tuning:
             return Trainer(self.algorithm, self.env, runs=self.runs, **given)
         try:
             allow = [self.algorithm, self.env, *self.config.run.wrap]
-            now = {key: given[key] for key in ON_RESUME & given.keys()}
+            now = {key: given[key] for key in WITHOUT_RESULT & given.keys()}
             trainer = Trainer.resume(directory.path, runs=self.runs, allow=allow, **now)
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
@@ -247,6 +251,13 @@ def _score(rows: list[Row]) -> float:
     found = [row for row in rows if row["kind"] == "eval" and row["step"] > 0]
     means = [row["mean"] for row in found if row["updates"] > 0] or [row["mean"] for row in found]
     return float(np.mean(means[-max(FEWEST, len(means) // 10) :]))
+
+
+def _holds_none(value: Any) -> bool:
+    """Whether a value, or one inside it, is None, for which TOML has no word."""
+    if isinstance(value, dict):
+        return any(map(_holds_none, value.values()))
+    return value is None or (isinstance(value, (list, tuple)) and any(map(_holds_none, value)))
 
 
 def _toml(value: Any) -> str:
