@@ -37,7 +37,9 @@ class Run(Ensemble, Task):
         60.0, gt=0, description="time between checkpoints, such as 5m"
     )
     device: Literal["auto", "cpu", "gpu", "tpu"] = Field(
-        "auto", description="device that runs the updates"
+        "auto",
+        description="device that runs the updates; auto takes JAX's own choice, a GPU before "
+        "the CPU",
     )
 
 
@@ -163,7 +165,10 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             )
         rollout = hyper.parallel_envs * hyper.rollout_length
         if run.steps < rollout:
-            raise UsageError(f"steps: {run.steps} is less than one rollout of {rollout} steps")
+            raise UsageError(
+                f"steps: {run.steps} is less than one rollout of {rollout} steps; give at least "
+                "that, or a smaller --rollout-length or --parallel-envs"
+            )
     return Config(run, hyper)
 
 

@@ -140,10 +140,14 @@ def _refuse_unfit(policy: Policy, world: Environment) -> None:
     if (taken, given) != (world.observation_size, world.action_size):
         raise UsageError(
             f"env: {world.name} has observations of {world.observation_size} and actions of "
-            f"{world.action_size}; the policy takes {taken} and gives {given}"
+            f"{world.action_size}; the policy takes {taken} and gives {given}; play the task that "
+            "it was trained on, by --env, --env.KEY and --wrap"
         )
     if not (np.array_equal(policy.low, world.low) and np.array_equal(policy.high, world.high)):
-        raise UsageError(f"env: {world.name} has other action bounds than the policy")
+        raise UsageError(
+            f"env: {world.name} has other action bounds than the policy; play the task that it was "
+            "trained on"
+        )
 
 
 def _acting(policy: Policy | None, env: Environment, noise: float, seed: int) -> Act:

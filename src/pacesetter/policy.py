@@ -152,7 +152,8 @@ def load(path: str | Path) -> Policy:
     arrays, table = storage.read(path.resolve() if path.is_symlink() else path, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
-            f"{path}: policy schema {table.get('schema')}; this version reads {SCHEMA}"
+            f"{path}: policy schema {table.get('schema')}; this version reads {SCHEMA}; "
+            "use the version of pacesetter that wrote it"
         )
     try:
         policy = Policy(

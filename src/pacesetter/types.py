@@ -20,6 +20,10 @@ Layers = Sequence[dict[str, Floats]]
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 # Of losses, weights and moments: so near to infinity that the next products reach it.
 DIVERGED = 1e30
+DIVERGENCE = (  # why, and what a person can do
+    "learning has diverged, and resume would repeat it; train under another --name with smaller "
+    "learning rates"
+)
 ALLOWED = f"finite and at most {LARGEST:.1e} in size"
 
 

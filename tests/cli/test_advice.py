@@ -20,7 +20,7 @@ def test_a_budget_within_the_warmup_is_said_before_it_starts(
 ) -> None:
     assert main(["train", "td3", TASK, "--steps", "100", "--runs", str(tmp_path), *FLAGS]) == 0
     first = capsys.readouterr().err.splitlines()[0]
-    assert "all 100 steps are within the warm-up of 25,000" in first
+    assert "the run has 100 steps and acts at random for the first 25,000, so" in first
     assert "--warmup 10" in first
 
 

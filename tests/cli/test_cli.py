@@ -516,7 +516,7 @@ def test_progress_goes_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     assert file.is_file()
     called = Path(*file.parent.parts[-3:])
     assert name == f"run: {called}, a name for show, eval, record, resume and compare"
-    assert watch == f"watch it: `pacesetter record {called} -o walk.mp4 --allow {PROBE}`"
+    assert watch == f"film it: `pacesetter record {called} -o walk.mp4 --allow {PROBE}`"
 
 
 def test_eval_of_a_run(command: Command) -> None:

@@ -46,45 +46,49 @@ def _check_bins(bins: int, info: ValidationInfo) -> int:
 class Hyper(OffPolicy):
     """Defaults are the paper's; `crossq-small` has critics as narrow as the actor."""
 
-    warmup: Warmup = Field(5_000, ge=0, description="first steps of all members, uniform actions")
+    warmup: Warmup = Field(
+        5_000, ge=0, description="env steps of uniformly random actions at the start, all members"
+    )
     hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of the actor's hidden layers"
     )
     critic_hidden: tuple[Width, ...] = Field(
         (2048, 2048), min_length=1, description="widths of the critics' hidden layers"
     )
-    actor_learning_rate: LearningRate = Field(1e-3, gt=0, description="Adam step size of the actor")
+    actor_learning_rate: LearningRate = Field(
+        1e-3, gt=0, description="Adam learning rate of the actor"
+    )
     critic_learning_rate: LearningRate = Field(
-        1e-3, gt=0, description="Adam step size of the critics"
+        1e-3, gt=0, description="Adam learning rate of the critics"
     )
     alpha_learning_rate: float = Field(
-        1e-3, gt=0, description="Adam step size of the log temperature"
+        1e-3, gt=0, description="Adam learning rate of the log temperature"
     )
-    adam_momentum: float = Field(
-        0.5, ge=0, lt=1, description="Adam's first decay for actor and critics"
-    )
+    adam_momentum: float = Field(0.5, ge=0, lt=1, description="Adam's beta1 for actor and critics")
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
     target_entropy: float | None = Field(None, description="in nats; default minus the action size")
-    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
+    critics: int = Field(2, ge=1, le=100, description="critics; the target uses their minimum")
     policy_delay: int = Field(3, ge=1, le=1_000, description="critic updates per actor update")
     renorm_after: Count = Field(
         100_000,
         ge=0,
         le=LARGEST_COUNTED,
-        description="a network's updates with plain batch norm before renorm",
+        description="updates of a network with plain batch norm before batch renorm begins",
     )
     weight_norm: bool = Field(
-        False, description="keep the weights into every hidden unit at length 1"
+        False,
+        description="divide the weights into each hidden unit by their L2 norm after each update",
     )
     next_batch_gradient: bool = Field(
-        True, description="gradient through (s', a') where they shape a batch's mean and variance"
+        True, description="let gradients flow through (s', a') in the batch statistics"
     )
     bins: Annotated[int, AfterValidator(_check_bins)] = Field(
         0,
         ge=0,
         le=1_001,
-        description="bins of the return that each critic learns the shares of, usually 51, with "
-        "rewards over the running standard deviation of returns; 0 learns the mean",
+        description="bins of the return distribution that each critic learns, usually 51; "
+        "rewards are then divided by the running standard deviation of discounted"
+        " returns; 0 learns only the mean",
     )
     exploration: Exploration = Field(
         "policy", description="fixed: the stochastic policy explores by itself"

@@ -28,7 +28,9 @@ class Hyper(td3.Hyper):
         1, description="fixed: the actor moves at every update"
     )
     target_noise: Annotated[float, only(0)] = Field(0.0, description="fixed: no target smoothing")
-    action_layer: int = Field(0, ge=0, le=1, description="critic layer that the action joins")
+    action_layer: int = Field(
+        0, ge=0, le=1, description="critic layer that the action enters; 0 is the first"
+    )
     critic_decay: float = Field(0.0, ge=0, description="L2 decay added to the critic's gradient")
     output_bound: float | None = Field(
         None, gt=0, description="bound of initial output weights; default 1/sqrt(inputs)"

@@ -49,34 +49,53 @@ class Hyper(ModelDriven, trpo.Hyper):
     model_hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of a model's hidden layers"
     )
-    model_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the models")
+    model_learning_rate: float = Field(1e-3, gt=0, description="Adam learning rate of the models")
     model_noise: bool = Field(
-        False, description="models learn a deviation too, of which imagined steps draw"
+        False,
+        description="models also learn a standard deviation, with which imagined steps are drawn",
     )
-    model_batch_size: SmallCount = Field(1000, description="rows in a model's minibatch")
-    model_patience: SmallCount = Field(5, description="passes without a fall that end a fit")
+    model_batch_size: SmallCount = Field(1000, description="rows per minibatch of a model")
+    model_patience: SmallCount = Field(
+        5, description="passes over the data without a lower held-out loss before a fit ends"
+    )
     model_rows: Count = Field(
-        250_000, ge=1, le=LARGEST_COUNTED, description="rows that a fit goes through at most"
+        250_000,
+        ge=1,
+        le=LARGEST_COUNTED,
+        description="rows that all passes of one fit may go through together",
     )
     renew_every: SmallCountOr0 = Field(
-        0, description="iterations from new networks to new; 0: never"
+        0, description="iterations between fits that begin with new weights; 0 never does"
     )
     imagined_steps: Count = Field(
         20_000,
         ge=1,
         le=LARGEST_COUNTED,
-        description="imagined steps of a policy update, in whole episodes at most",
+        description="imagined steps per policy update, rounded down to whole episodes of --horizon",
     )
     horizon: Annotated[int, AfterValidator(_fits)] = Field(
-        1000, ge=1, validate_default=True, description="longest imagined episode"
+        1000, ge=1, validate_default=True, description="steps per imagined episode at most"
     )
-    bootstrap: bool = Field(True, description="the critic's value counts at the horizon")
-    policy_updates: SmallCount = Field(50, description="policy updates of an iteration at most")
-    check_every: SmallCount = Field(5, description="policy updates between checks in all models")
-    patience: SmallCount = Field(25, description="policy updates without a kept policy that end it")
-    share: float = Field(0.7, ge=0, le=1, description="share of models that must not see a fall")
+    bootstrap: bool = Field(
+        True, description="add the critic's value where an imagined episode is cut at --horizon"
+    )
+    policy_updates: SmallCount = Field(50, description="policy updates per iteration at most")
+    check_every: SmallCount = Field(
+        5, description="policy updates between evaluations in every model"
+    )
+    patience: SmallCount = Field(
+        25, description="policy updates without a kept policy before the iteration ends"
+    )
+    share: float = Field(
+        0.7,
+        ge=0,
+        le=1,
+        description="share of models whose return must not fall for a policy to be kept",
+    )
     critic_epochs: SmallCountOr0 = Field(5, description="passes of the critic over imagined steps")
-    critic_batch_size: SmallCount = Field(1000, description="observations in its minibatches")
+    critic_batch_size: SmallCount = Field(
+        1000, description="observations per minibatch of the critic"
+    )
 
 
 class State(NamedTuple):

@@ -34,9 +34,11 @@ NEXT_Q = 1  # what is folded into a target's key for `next_q`; the action has th
 class Hyper(ActorCritic):
     """Defaults as in the paper's second version; warm-up is uniform, as in Spinning Up."""
 
-    warmup: Warmup = Field(10_000, ge=0, description="first steps of all members, uniform actions")
+    warmup: Warmup = Field(
+        10_000, ge=0, description="env steps of uniformly random actions at the start, all members"
+    )
     alpha_learning_rate: LearningRate = Field(
-        3e-4, gt=0, description="Adam step size of the log temperature"
+        3e-4, gt=0, description="Adam learning rate of the log temperature"
     )
     initial_alpha: float = Field(1.0, gt=0, description="temperature at the start")
     target_entropy: float | None = Field(None, description="in nats; default minus the action size")

@@ -59,13 +59,15 @@ class ExpansionHyper:
         4,
         ge=1,
         validate_default=True,
-        description="critics whose disagreement weights the target; each learns on its own rows",
+        description="critics whose disagreement weights the target; each learns from its own "
+        "share of a minibatch",
     )
     models: Annotated[int, AfterValidator(has_rows)] = Field(
         4,
         ge=1,
         validate_default=True,
-        description="models, and reward heads; each learns on its own rows",
+        description="learned models, and as many reward heads; each learns from its own share of a "
+        "minibatch",
     )
     model_hidden: tuple[Width, ...] = Field(
         (256, 256), min_length=1, description="widths of a model's hidden layers"
@@ -73,7 +75,7 @@ class ExpansionHyper:
     head_hidden: tuple[Width, ...] = Field(
         (64, 64), min_length=1, description="widths in the heads for reward and termination"
     )
-    model_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the models")
+    model_learning_rate: float = Field(1e-3, gt=0, description="Adam learning rate of the models")
     model_decay: float = Field(0.0, ge=0, description="L2 decay added to the models' gradient")
     quantiles: Annotated[int, only(0)] = Field(0, description="fixed: variances are of means")
     n_step: Annotated[int, only(1)] = Field(1, description="fixed: models learn single steps")

@@ -50,7 +50,9 @@ class Ensemble:
     Defaults are the reference's, with `ucb` from the range that the paper searched.
     """
 
-    ensemble: int = Field(5, ge=1, le=100, description="learners in one state (N)")
+    ensemble: int = Field(
+        5, ge=1, le=100, description="learners per member, which act in one env (N)"
+    )
     mask_probability: float = Field(
         0.5, gt=0, le=1, description="chance that a learner trains on a transition (beta)"
     )
@@ -58,7 +60,9 @@ class Ensemble:
         20.0, ge=0, description="temperature T of the weighted Bellman backup; 0 weights all alike"
     )
     ucb: float = Field(
-        1.0, ge=0, description="standard deviations added to an action's value (lambda)"
+        1.0,
+        ge=0,
+        description="standard deviations added to a proposed action's mean value (lambda)",
     )
     reference: Literal["paper", "official"] = Field(
         "paper", description="formulas as published, or as in the authors' code"

@@ -40,10 +40,14 @@ class Hyper(OffPolicy):
     """Defaults are the reference repository's; noise is in units of actions in [-1, 1]."""
 
     replay: Literal["uniform", "prioritized", "lap", "return"] = Field(
-        "lap", description="sample transitions alike, by TD error (PER; LAP) or by episode return"
+        "lap",
+        description="sample transitions uniformly, by TD error (PER or LAP) or by episode return",
     )
     assess: int = Field(
-        20, ge=0, description="episodes that assess a policy before it learns on; 0 is off"
+        20,
+        ge=0,
+        description="training episodes that a policy plays unchanged before it may become the"
+        " one that is evaluated, 20 in TD7; 0 disables it",
     )
     hidden: tuple[Width, ...] = Field(
         (256, 256),
@@ -54,14 +58,16 @@ class Hyper(OffPolicy):
         (256, 256), description="widths of the two hidden layers of each encoder"
     )
     encoder_size: Width = Field(256, description="numbers in an embedding")
-    actor_learning_rate: LearningRate = Field(3e-4, gt=0, description="Adam step size of the actor")
+    actor_learning_rate: LearningRate = Field(
+        3e-4, gt=0, description="Adam learning rate of the actor"
+    )
     critic_learning_rate: LearningRate = Field(
-        3e-4, gt=0, description="Adam step size of the critics"
+        3e-4, gt=0, description="Adam learning rate of the critics"
     )
     encoder_learning_rate: LearningRate = Field(
-        3e-4, gt=0, description="Adam step size of the encoders"
+        3e-4, gt=0, description="Adam learning rate of the encoders"
     )
-    critics: int = Field(2, ge=1, le=100, description="critics whose minimum is the target")
+    critics: int = Field(2, ge=1, le=100, description="critics; the target uses their minimum")
     policy_delay: int = Field(2, ge=1, le=1_000, description="critic updates per actor update")
     copy_every: SmallCount = Field(250, description="critic updates between copies to the targets")
     target_noise: float = Field(

@@ -44,18 +44,26 @@ class Hyper(OnPolicy):
     """Tianshou's for MuJoCo, but for longer steps, less damping and minibatches of the critic."""
 
     hidden: tuple[Width, ...] = Field((64, 64), min_length=1, description="widths of hidden layers")
-    initial_std: float = Field(0.6, gt=0, description="deviation of actions at the start")
-    gae_lambda: float = Field(0.95, ge=0, le=1, description="decay of later errors in advantages")
-    max_kl: float = Field(0.02, gt=0, description="bound of the mean KL of one update, in nats")
+    initial_std: float = Field(0.6, gt=0, description="standard deviation of actions at the start")
+    gae_lambda: float = Field(
+        0.95, ge=0, le=1, description="lambda of generalised advantage estimation"
+    )
+    max_kl: float = Field(0.02, gt=0, description="largest mean KL divergence per update, in nats")
     damping: float = Field(0.01, ge=0, description="added to the Fisher matrix's diagonal")
     gradient_steps: int = Field(
-        10, ge=1, le=1_000, description="conjugate gradient steps an update"
+        10, ge=1, le=1_000, description="conjugate gradient steps per update"
     )
-    backtracks: int = Field(10, ge=1, le=1_000, description="lengths that the line search tries")
-    backtrack_ratio: float = Field(0.8, gt=0, lt=1, description="each length by the one before")
-    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step of the critic")
-    critic_epochs: SmallCountOr0 = Field(20, description="passes of the critic over a rollout")
-    critic_batch_size: SmallCount = Field(128, description="observations in its minibatches")
+    backtracks: int = Field(
+        10, ge=1, le=1_000, description="step lengths that the line search tries at most"
+    )
+    backtrack_ratio: float = Field(
+        0.8, gt=0, lt=1, description="factor from one tried step length to the next"
+    )
+    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam learning rate of the critic")
+    critic_epochs: SmallCountOr0 = Field(20, description="passes of the critic per rollout")
+    critic_batch_size: SmallCount = Field(
+        128, description="observations per minibatch of the critic"
+    )
 
 
 class State(NamedTuple):

@@ -25,10 +25,10 @@ def within_warmup(config: "Config") -> str | None:
     if steps // block * block > warmup or getattr(hyper, "warmup_updates", False):
         return None
     less = max(steps // 10, 1)
-    blocks = f", but for less than a block of {block:,}" if steps > warmup else ""
+    blocks = f", and the rest is less than a block of {block:,}" if steps > warmup else ""
     return (
-        f"warmup: all {steps:,} steps are within the warm-up of {warmup:,} random ones{blocks}, so "
-        f"nothing is learned; give more --steps, or less warm-up, such as --warmup {less}"
+        f"warmup: the run has {steps:,} steps and acts at random for the first {warmup:,}{blocks}, "
+        f"so nothing is learned; give more --steps, or a shorter warm-up such as --warmup {less}"
     )
 
 

@@ -77,7 +77,7 @@ def _parser(name: str | None) -> Parser:
         type=int,
         metavar="N",
         default=absent,
-        help="number of seeds, or the seeds themselves",
+        help="one number: how many seeds, from 0 on; several numbers: these seeds",
     )
     jobs = "runs at once (default one per core, pinned to it)"
     add("--jobs", type=int, metavar="N", help=jobs)

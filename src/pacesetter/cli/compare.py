@@ -41,12 +41,13 @@ def _parser() -> Parser:
     add("--metric", default="final", metavar="X", help=metrics)
     add("--budget", metavar="N", help="count each run only up to N env steps")
     add("--cpu", metavar="T", help="count each run only up to this CPU time, such as 10m")
-    reference = "algorithm that the others are compared with (default td3)"
+    reference = "name of the runs that the others are compared with (default td3)"
     add("--reference", default="td3", metavar="NAME", help=reference)
     add("--published", action="store_true", help="add published returns of other implementations")
     mixed = "compare different env versions, budgets or settings, and say so"
     add("--mixed", action="store_true", help=mixed)
-    add("--smooth", type=int, metavar="N", help="smooth curves over N evaluations")
+    smooth = "smooth curves over N evaluations, an odd number of at least 5 (default no smoothing)"
+    add("--smooth", type=int, metavar="N", help=smooth)
     add("--no-film", action="store_true", help="leave the video out of the report")
     output = (
         "write a .html report, .md or .tex tables, .csv or .json numbers, or .png, .svg or .pdf "

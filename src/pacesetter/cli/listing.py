@@ -108,7 +108,12 @@ LISTS: dict[str, Callable[[], list[Row]]] = {
     "suites": suites,
     "champions": champions,
 }
-HINTS = {"envs": "any other Gymnasium id with observations and actions of numbers, or module:Id-v0"}
+HINTS = {
+    "envs": (
+        "any other Gymnasium id with a vector of numbers as observation and bounded continuous "
+        "actions, or module:Id-v0"
+    )
+}
 
 
 def runs(folder: str) -> list[Row]:

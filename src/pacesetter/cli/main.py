@@ -52,7 +52,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"pacesetter: stopped: {error}", file=sys.stderr)
         return error.code
     except MemoryError as error:
-        print(f"pacesetter: stopped: out of memory: {error}; ask for less", file=sys.stderr)
+        less = "lower --members, --batch-size or --replay-size"
+        print(f"pacesetter: stopped: out of memory: {error}; {less}", file=sys.stderr)
         return 1
     except Interrupted as signal:
         return exit_code([*signal.args])

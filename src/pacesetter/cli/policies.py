@@ -13,7 +13,7 @@ from pacesetter.settings import Settings
 if TYPE_CHECKING:
     from pacesetter.policy import Policy
 
-RUN = "run folder, the end of its path, a policy file, or champion:NAME"
+RUN = "run folder or the end of its path (its policy.safetensors), a policy file, or champion:NAME"
 
 
 class Found(NamedTuple):

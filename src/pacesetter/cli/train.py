@@ -165,5 +165,5 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
     print(f"policy: {trainer.directory.policy_file}")
     print(f"run: {called}, a name for show, eval, record, resume and compare")
     film = ["record", called, "-o", "walk.mp4", *consent.words(run.env, *run.wrap)]
-    print(f"watch it: `pacesetter {shlex.join(film)}`")
+    print(f"film it: `pacesetter {shlex.join(film)}`")
     return 0

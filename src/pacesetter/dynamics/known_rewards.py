@@ -53,7 +53,7 @@ def of(env: str, env_kwargs: dict[str, Any] | None = None) -> Known:
     if changed := set(env_kwargs or {}) - HARMLESS:
         raise UsageError(
             f"env_kwargs: {min(changed)} may change the reward, which is known of {env} as it is; "
-            "leave it out"
+            "leave it out, or give --no-known to learn the reward"
         )
     return Known(TASKS[env].reward, TASKS[env].terminated)
 

@@ -12,7 +12,7 @@ from pacesetter.ensemble.varied import inherited
 from pacesetter.errors import TrainingError
 from pacesetter.settings.budget import Standing
 from pacesetter.settings.validation import Finite, Natural, check
-from pacesetter.types import DIVERGED, Arrays, Floats
+from pacesetter.types import DIVERGED, DIVERGENCE, Arrays, Floats
 
 TRAIN_ROW_EVERY = 1_000  # steps
 
@@ -123,7 +123,7 @@ class Progress:
         """Add the losses of one update to what the next row averages, if none has diverged."""
         for name, loss in zip(names, losses.tolist(), strict=True):
             if not abs(loss) <= DIVERGED:
-                raise TrainingError(f"{who}step {self.step}: {name} is {loss}")
+                raise TrainingError(f"{who}step {self.step}: {name} is {loss}; {DIVERGENCE}")
             self.losses[name] = self.losses.get(name, 0.0) + loss
         self.summed += 1
 

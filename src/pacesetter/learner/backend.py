@@ -52,7 +52,7 @@ def device_faults() -> Generator[None]:
         yield
     except jax.errors.JaxRuntimeError as error:
         full = "RESOURCE_EXHAUSTED" in str(error)
-        what = "is out of memory, ask for less" if full else "fails"
+        what = "is out of memory, lower --members, --batch-size or the widths" if full else "fails"
         raise TrainingError(f"the {platform()} {what}: {error}") from error
 
 

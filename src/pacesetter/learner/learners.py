@@ -17,7 +17,7 @@ from pacesetter.learner.tree_arrays import flatten, rebuild
 from pacesetter.policy import Policy
 from pacesetter.process import threads
 from pacesetter.seeding import Stream, generator
-from pacesetter.types import DIVERGED, Arrays, worst
+from pacesetter.types import DIVERGED, DIVERGENCE, Arrays, worst
 
 
 class Learners:
@@ -60,7 +60,9 @@ class Learners:
         for k in members:
             for name, array in flatten(self.states[k]).items():
                 if (found := worst(array, DIVERGED)) is not None:
-                    raise TrainingError(f"member {k}, step {step}: {name} holds {found}")
+                    raise TrainingError(
+                        f"member {k}, step {step}: {name} holds {found}; {DIVERGENCE}"
+                    )
 
     def policy(self, member: int, env: Environment, statistics: Statistics) -> Policy:
         """A member's policy as it is now, for an env like this one."""

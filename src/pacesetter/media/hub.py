@@ -77,7 +77,10 @@ def _refuse_another(task: Recipe, about: dict[str, Any]) -> None:
     names = ("env", "env", "wrap")
     for name, given, trained in zip(names, (task.name, task.kwargs, task.wrap), own, strict=True):
         if given != trained:
-            raise UsageError(f"{name}: the card tells of the task that the policy was trained on")
+            raise UsageError(
+                f"{name}: the card tells of the task that the policy was trained on; leave out "
+                "--env, --env.KEY and --wrap"
+            )
 
 
 @contextmanager

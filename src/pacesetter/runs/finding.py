@@ -54,13 +54,15 @@ def find(name: str, runs: str | Path = "runs") -> RunDirectory:
     if len(found) == 1:
         return found[0]
     if found:
-        raise UsageError(f"run: '{name}' matches {_few(found)}")
+        raise UsageError(
+            f"run: '{name}' matches {_few(found)}; give more of its path, such as ENV/NAME/SEED"
+        )
     from pacesetter.policy import file_of
 
     if file_of(name):
         raise UsageError(f"run: {name} is a policy file; give a run, which has a log and states")
     known = list(find_all(runs))
-    near = f"; there are {_few(known)}" if known else f"; no runs below {runs}"
+    near = f"; there are {_few(known)}" if known else f"; no runs below {runs}, give --runs"
     raise UsageError(f"run: '{name}' not found{near}")
 
 

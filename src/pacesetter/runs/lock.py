@@ -50,7 +50,9 @@ class Lock:
         except BlockingIOError:
             holder = _text(file) or "another process"
             file.close()
-            raise InUseError(f"{self.path.parent} is in use by {holder}") from None
+            raise InUseError(
+                f"{self.path.parent} is in use by {holder}; wait until it ends, or stop it"
+            ) from None
         except BaseException:
             file.close()
             raise

@@ -128,8 +128,8 @@ class OffPolicy(Hyper):
     assess: int = Field(
         0,
         ge=0,
-        description="episodes that assess a policy before its next updates, as in TD7 (20 there); "
-        "0 disables assessment",
+        description="training episodes that a policy plays unchanged before it may become the"
+        " one that is evaluated, 20 in TD7; 0 disables it",
     )
     assess_after: Annotated[Count | None, AfterValidator(_check_assess)] = Field(
         None,

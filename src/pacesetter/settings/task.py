@@ -56,7 +56,11 @@ class Task:
         default_factory=dict, description="keywords for gymnasium.make"
     )
     name: str = Field(pattern=r"^\w[\w.-]*$", description="name of the run's folder, below its env")
-    steps: Count = Field(1_000_000, ge=1, description="budget of env steps, all members together")
+    steps: Count = Field(
+        1_000_000,
+        ge=1,
+        description="budget of env steps, of all members together unless --count member",
+    )
     time: Duration | None = Field(
         None, gt=0, description="stop after this wall time, such as 2h; default no limit"
     )

@@ -23,7 +23,7 @@ class RunSettings(TypedDict, total=False):
     name: str
     """name of the run's folder, below its env"""
     steps: int | str
-    """budget of env steps, all members together"""
+    """budget of env steps, of all members together unless --count member"""
     time: float | str | None
     """stop after this wall time, such as 2h; default no limit"""
     stop_at: float | None
@@ -85,7 +85,7 @@ class RunSettings(TypedDict, total=False):
     checkpoint_every: float | str
     """time between checkpoints, such as 5m"""
     device: Literal["auto", "cpu", "gpu", "tpu"]
-    """device that runs the updates"""
+    """device that runs the updates; auto takes JAX's own choice, a GPU before the CPU"""
     gamma: float
     """discount factor per env step"""
     normalize_observation: bool
@@ -107,7 +107,7 @@ class RunSettings(TypedDict, total=False):
     n_step: int
     """rewards summed in an n-step target"""
     assess: int
-    """episodes that assess a policy before its next updates, as in TD7 (20 there); 0..."""
+    """training episodes that a policy plays unchanged before it may become the one that is..."""
     assess_after: int | str | None
     """updates of a member before assessments take several episodes; default 750000"""
     warmup: int | str
@@ -163,11 +163,11 @@ class RunSettings(TypedDict, total=False):
     encoder_size: int
     """numbers in an embedding"""
     encoder_learning_rate: float
-    """Adam step size of the encoders"""
+    """Adam learning rate of the encoders"""
     copy_every: int
     """critic updates between copies to the targets"""
     alpha_learning_rate: float
-    """Adam step size of the log temperature"""
+    """Adam learning rate of the log temperature"""
     initial_alpha: float
     """temperature at the start"""
     target_entropy: float | None
@@ -177,27 +177,27 @@ class RunSettings(TypedDict, total=False):
     critic_hidden: Sequence[int]
     """widths of the critics' hidden layers"""
     adam_momentum: float
-    """Adam's first decay for actor and critics"""
+    """Adam's beta1 for actor and critics"""
     renorm_after: int | str
-    """a network's updates with plain batch norm before renorm"""
+    """updates of a network with plain batch norm before batch renorm begins"""
     weight_norm: bool
-    """keep the weights into every hidden unit at length 1"""
+    """divide the weights into each hidden unit by their L2 norm after each update"""
     next_batch_gradient: bool
-    """gradient through (s', a') where they shape a batch's mean and variance"""
+    """let gradients flow through (s', a') in the batch statistics"""
     bins: int
-    """bins of the return that each critic learns the shares of, usually 51, with rewards..."""
+    """bins of the return distribution that each critic learns, usually 51; rewards are then..."""
     ensemble: int
-    """learners in one state (N)"""
+    """learners per member, which act in one env (N)"""
     mask_probability: float
     """chance that a learner trains on a transition (beta)"""
     backup_temperature: float
     """temperature T of the weighted Bellman backup; 0 weights all alike"""
     ucb: float
-    """standard deviations added to an action's value (lambda)"""
+    """standard deviations added to a proposed action's mean value (lambda)"""
     reference: Literal["paper", "official"]
     """formulas as published, or as in the authors' code"""
     action_layer: int
-    """critic layer that the action joins"""
+    """critic layer that the action enters; 0 is the first"""
     critic_decay: float
     """L2 decay added to the critic's gradient"""
     output_bound: float | None
@@ -205,15 +205,15 @@ class RunSettings(TypedDict, total=False):
     horizon: int
     """rollout horizon H in the models; 0 uses no model"""
     critic_members: int
-    """critics whose disagreement weights the target; each learns on its own rows"""
+    """critics whose disagreement weights the target; each learns from its own share of a..."""
     models: int
-    """models, and reward heads; each learns on its own rows"""
+    """learned models, and as many reward heads; each learns from its own share of a minibatch"""
     model_hidden: Sequence[int]
     """widths of a model's hidden layers"""
     head_hidden: Sequence[int]
     """widths in the heads for reward and termination"""
     model_learning_rate: float
-    """Adam step size of the models"""
+    """Adam learning rate of the models"""
     model_decay: float
     """L2 decay added to the models' gradient"""
     parallel_envs: int
@@ -221,49 +221,49 @@ class RunSettings(TypedDict, total=False):
     rollout_length: int | str
     """steps of each env per rollout"""
     initial_std: float
-    """deviation of actions at the start"""
+    """standard deviation of actions at the start"""
     gae_lambda: float
-    """decay of later errors in advantages"""
+    """lambda of generalised advantage estimation"""
     max_kl: float
-    """bound of the mean KL of one update, in nats"""
+    """largest mean KL divergence per update, in nats"""
     damping: float
     """added to the Fisher matrix's diagonal"""
     gradient_steps: int
-    """conjugate gradient steps an update"""
+    """conjugate gradient steps per update"""
     backtracks: int
-    """lengths that the line search tries"""
+    """step lengths that the line search tries at most"""
     backtrack_ratio: float
-    """each length by the one before"""
+    """factor from one tried step length to the next"""
     critic_epochs: int
-    """passes of the critic over a rollout"""
+    """passes of the critic per rollout"""
     critic_batch_size: int
-    """observations in its minibatches"""
+    """observations per minibatch of the critic"""
     starts: int
     """resets per update that start imagined episodes; not counted as env steps"""
     known: bool
     """use the walker's known reward and termination instead of learning them"""
     model_noise: bool
-    """models learn a deviation too, of which imagined steps draw"""
+    """models also learn a standard deviation, with which imagined steps are drawn"""
     model_batch_size: int
-    """rows in a model's minibatch"""
+    """rows per minibatch of a model"""
     model_patience: int
-    """passes without a fall that end a fit"""
+    """passes over the data without a lower held-out loss before a fit ends"""
     model_rows: int | str
-    """rows that a fit goes through at most"""
+    """rows that all passes of one fit may go through together"""
     renew_every: int
-    """iterations from new networks to new; 0: never"""
+    """iterations between fits that begin with new weights; 0 never does"""
     imagined_steps: int | str
-    """imagined steps of a policy update, in whole episodes at most"""
+    """imagined steps per policy update, rounded down to whole episodes of --horizon"""
     bootstrap: bool
-    """the critic's value counts at the horizon"""
+    """add the critic's value where an imagined episode is cut at --horizon"""
     policy_updates: int
-    """policy updates of an iteration at most"""
+    """policy updates per iteration at most"""
     check_every: int
-    """policy updates between checks in all models"""
+    """policy updates between evaluations in every model"""
     patience: int
-    """policy updates without a kept policy that end it"""
+    """policy updates without a kept policy before the iteration ends"""
     share: float
-    """share of models that must not see a fall"""
+    """share of models whose return must not fall for a policy to be kept"""
 
 
 class TrainerSettings(RunSettings, total=False):

@@ -83,7 +83,10 @@ def restore(loop: Loop, config: Config, directory: RunDirectory) -> list[str]:
         notes = [f"{directory.state_file}: is missing"]
     if notes:
         first = notes[0].removesuffix("; trying the checkpoint before it")
-        raise UsageError(f"{first}; no whole checkpoint is left in {directory.path}")
+        raise UsageError(
+            f"{first}; no whole checkpoint is left in {directory.path}; "
+            "train it again under another --name"
+        )
     return ["no checkpoint yet, starting from the beginning"]
 
 
@@ -109,7 +112,8 @@ def _restore(
     if table["threads"] != threads() and loop.progress.step < loop.budget:
         notes.append(
             f"made with {table['threads']} threads, going on with {threads()}: "
-            "results will differ in their last bits"
+            "results will differ in their last bits; "
+            f"NPROC={table['threads']} keeps them equal"
         )
     made_by, now_by = table.get("products", "xla"), products.of(config.hyper)
     if made_by != now_by and loop.progress.step < loop.budget:

@@ -74,6 +74,11 @@ def refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None:
             "it again under another --name"
         )
     if schema != SCHEMA:
-        raise UsageError(f"{file}: checkpoint schema {schema}, this version reads {SCHEMA}")
+        raise UsageError(
+            f"{file}: checkpoint schema {schema}, this version reads {SCHEMA}; "
+            "use the version of pacesetter that wrote it"
+        )
     if table.get("run") != identity(config):
-        raise UsageError(f"{file}: is of another run: {table.get('run')}")
+        raise UsageError(
+            f"{file}: is of another run: {table.get('run')}; put this run's own file back"
+        )

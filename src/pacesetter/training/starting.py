@@ -41,7 +41,8 @@ def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None
     for name in ("algorithm", "normalize_observation", "normalize_reward"):
         if old.get(name, False) != new.get(name, False):
             raise UsageError(
-                f"start_from: {directory.path} has {name}={old.get(name)}, this run {new.get(name)}"
+                f"start_from: {directory.path} has {name}={old.get(name)}, this run "
+                f"{new.get(name)}; they must be the same"
             )
     champion = int(table["progress"]["champion"])
     found = below(f"states.{champion}", arrays)
@@ -57,11 +58,14 @@ def _from_run(loop: Loop, config: Config, source: str, runs: str | Path) -> None
 def _from_policy(loop: Loop, config: Config, file: Path) -> None:
     found = policy.load(file)
     if len(found.actors) > 1:
-        raise UsageError(f"start_from: {file} averages {len(found.actors)} actors; name its run")
+        raise UsageError(
+            f"start_from: {file} averages {len(found.actors)} actors, and a member has one; name "
+            "the run that it comes from"
+        )
     if found.normalizer is not None:
         raise UsageError(
             f"start_from: {file} acts on normalized observations, whose statistics a run keeps; "
-            "name its run"
+            "name the run that it comes from"
         )
     if config.hyper.normalize_observation:
         raise UsageError(
@@ -73,7 +77,7 @@ def _from_policy(loop: Loop, config: Config, file: Path) -> None:
     if (found.activation, found.output) != (own.activation, own.output):
         raise UsageError(
             f"start_from: {file} has an actor of {found.activation} and {found.output}, this run's "
-            f"has {own.activation} and {own.output}"
+            f"has {own.activation} and {own.output}; name a file of the same kind of algorithm"
         )
     loop.learners.replace([learner.with_actor(state, found.actors[0]) for state in states])
 

@@ -82,7 +82,9 @@ class Tuning:
             if key in self.fixed:
                 raise UsageError(f"{key}: each trial sets its own; seeds start at {TUNING_SEEDS}")
         if _holds_none(self.fixed.get("env_kwargs", {})):
-            raise UsageError("env: a keyword of none cannot be kept in a file of settings (TOML)")
+            raise UsageError(
+                "env: best.toml cannot hold a keyword of none; leave out --env.KEY none"
+            )
         if not self.ranges:
             raise UsageError("tune: no setting is left to search; all are fixed or have no range")
         if not self.file.name or self.file.is_dir():
