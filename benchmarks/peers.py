@@ -2,8 +2,9 @@
 
 python benchmarks/peers.py sb3-td3 HalfCheetah-v4 --seed 0 --steps 100000 -o results/peers.jsonl
 
-Needs `make .venv/peers`. Evaluations are ten episodes without noise on starts of their own, as
-ours; neither their seconds nor those of imports count for a peer.
+Needs `make .venv/peers`. rl_tools has our networks, since its own are of 64 units, and else its own
+defaults; the time of compiling it does not count. Evaluations are ten episodes without noise on
+starts of their own, as ours; neither their seconds nor those of imports count for a peer.
 """
 
 import argparse
@@ -26,6 +27,7 @@ PEERS = {
     "sbx-tqc": ("sbx", "TQC"),
     "sbx-crossq": ("sbx", "CrossQ"),
 }
+RL_TOOLS = "rl-tools-td3"
 PACKAGES = {"stable_baselines3": "stable-baselines3", "sbx": "sbx-rl"}
 
 
@@ -72,26 +74,73 @@ class Curve:
         return round(total, 3)
 
 
+class RLTools:
+    """rl_tools' TD3 with the names that `Curve` reads of a learner of SB3 or SBX."""
+
+    def __init__(self, env: str, seed: int, steps: int) -> None:
+        from gymnasium.wrappers import RescaleAction
+        from rltools import TD3
+
+        def task() -> gymnasium.Env[Any, Any]:
+            made = RescaleAction(gymnasium.make(env), -1, 1)
+            made.reset(seed=seed)
+            return made
+
+        self.num_timesteps, self.batch_size = 0, 100
+        space: Any = gymnasium.make(env).action_space
+        self.low, self.high = space.low, space.high
+        networks = {"ACTOR_HIDDEN_DIM": 256, "CRITIC_HIDDEN_DIM": 256}
+        self.state = TD3(
+            task, enable_evaluation=False, STEP_LIMIT=steps + 1, interface_name="peers", **networks
+        ).State(seed)
+
+    @property
+    def _n_updates(self) -> int:
+        """One per step after a warm-up of one batch."""
+        return max(self.num_timesteps - self.batch_size, 0)
+
+    def learn(self, steps: int, callback: Curve) -> None:
+        while self.num_timesteps < steps:
+            callback({"self": self}, {})
+            self.state.step()
+            self.num_timesteps += 1
+
+    def predict(self, observation: Any, deterministic: bool) -> tuple[Any, None]:
+        action = self.state.action(observation.astype("float32"))
+        return self.low + (action + 1) / 2 * (self.high - self.low), None
+
+
+def learner_of(peer: str, env: str, seed: int, steps: int) -> Any:
+    """A peer's learner with its defaults, on one thread."""
+    if peer == RL_TOOLS:
+        return RLTools(env, seed, steps)
+    module, name = PEERS[peer]
+    learner = getattr(__import__(module), name)("MlpPolicy", env, seed=seed)
+    if module == "stable_baselines3":
+        import torch
+
+        torch.set_num_threads(1)
+    return learner
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("peer", choices=PEERS)
+    parser.add_argument("peer", choices=[*PEERS, RL_TOOLS])
     parser.add_argument("env")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("-o", "--output", type=Path, required=True)
     given = parser.parse_args()
-    module, name = PEERS[given.peer]
-    learner = getattr(__import__(module), name)("MlpPolicy", given.env, seed=given.seed)
-    if module == "stable_baselines3":
-        import torch
-
-        torch.set_num_threads(1)
+    learner = learner_of(given.peer, given.env, given.seed, given.steps)
     curve = Curve(given.env, given.seed)
     learner.learn(given.steps, callback=curve)
     curve.stop()
     if curve.rows[-1][0] < given.steps:
         curve.add(learner)
-    names = (PACKAGES[module], "gymnasium", "mujoco", "numpy", "torch", "jax")
+    own = (
+        ("rltools",) if given.peer == RL_TOOLS else (PACKAGES[PEERS[given.peer][0]], "torch", "jax")
+    )
+    names = (*own, "gymnasium", "mujoco", "numpy")
     line = {
         "schema": 1,
         "settings": {

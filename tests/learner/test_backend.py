@@ -72,7 +72,8 @@ def test_a_fault_of_the_device_is_one_line(
     def fail(*arguments: Any) -> None:
         raise jax.errors.JaxRuntimeError(text)
 
-    said = f"the cpu {'is out of memory, lower --members, --batch-size or the widths' if 'RES' in text else 'fails'}: {text}"
+    full = "is out of memory, lower --members, --batch-size or the widths"
+    said = f"the cpu {full if 'RES' in text else 'fails'}: {text}"
     with monkeypatch.context() as patch:
         patch.setattr(trainers, "start_from", fail)
         with pytest.raises(TrainingError, match=said):

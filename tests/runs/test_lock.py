@@ -51,7 +51,9 @@ def test_one_holder_at_a_time(kind: str, tmp_path: Path) -> None:
     first.take()
     assert first.is_weak == (kind == "weak")
     assert second.is_held()
-    with pytest.raises(InUseError, match=f"in use by process {os.getpid()} on {platform.node()}; wait"):
+    with pytest.raises(
+        InUseError, match=f"in use by process {os.getpid()} on {platform.node()}; wait"
+    ):
         second.take()
     first.free()
     assert not second.is_held()
