@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numeric import same
 from scipy.stats import chisquare
 from short_runs import assert_same, log, run_to_end
 from stopping import kill_and_resume, only_run, stop_at
@@ -209,6 +211,8 @@ def searched(table: Any, **settings: Any) -> me_trpo.Search:
     hyper = me_trpo.Hyper(**{**SMALL, **fixed, **settings})
     algorithm = Scripted(Spec(1, 1), hyper)
     start = algorithm.base.init(jax.random.key(0))
+    wide = start.actor._replace(log_std=jnp.full(1, 7.0))  # which a search does not go on from
+    start = start._replace(actor=wide)
     none: Any = None
     return jax.jit(algorithm.search)(start, jnp.array(table, jnp.float32), none, jax.random.key(0))
 
@@ -238,6 +242,58 @@ def test_search_that_only_harms_gives_back_the_start() -> None:
     table = -np.arange(60)[:, None] * np.ones(5)
     found = searched(table)
     assert (found.made, found.kept.log_std) == (25, 0)
+
+
+# An iteration.
+
+
+class Remembering(me_trpo.METRPO):
+    """A search whose last policy is not the one that was kept; each counts from the given one."""
+
+    def search(self, learner: trpo.State, models: Any, starts: Any, key: Any) -> me_trpo.Search:
+        def at(log_std: Any) -> trust_region.Gaussian:
+            return learner.actor._replace(log_std=log_std)
+
+        now = learner.actor.log_std
+        last = learner._replace(actor=at(now + 5))
+        return me_trpo.Search(last, at(now + 1), jnp.zeros(2), jnp.array(2), jnp.array(3))
+
+
+def test_iterations_fit_from_before_or_anew_and_go_on_with_the_policy_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With `renew_every` 2, fits 0 and 2 begin with new networks, 1 and 3 with those fitted last;
+    all learn from actions as the env was given them. Each search begins where the last one kept.
+    """
+    algorithm = Remembering(Spec(1, 1), me_trpo.Hyper(**{**SMALL, "renew_every": 2}), CART)
+    fits: list[tuple[Models, Any, Models]] = []
+
+    def fit(dynamics: Any, models: Models, data: Batch, *rest: Any) -> Any:
+        moved = jax.tree.map(lambda x: x + 1, models)
+        fits.append((models, data.action, moved))
+        return SimpleNamespace(models=moved, loss=jnp.zeros(2), epochs=jnp.array(4))
+
+    monkeypatch.setattr(me_trpo, "fit", fit)
+    column, action = jnp.zeros((4, 1)), jnp.array([[-3.0], [-0.5], [0.5], [1.5]])
+    batch = Batch(
+        observation=column, action=action, reward=column[:, 0], next_observation=column,
+        discount=column[:, 0], last=column[:, 0], mask=jnp.zeros((4, 0)), starts=column, valid=4,
+    )  # fmt: skip
+    states = [algorithm.init(jax.random.key(0))]
+    for i in range(4):
+        states.append(algorithm.update(states[-1], batch, jax.random.key(i)).state)
+    for i, (given, seen, _) in enumerate(fits):
+        fit_key, _ = jax.random.split(jax.random.key(i))
+        new = algorithm.dynamics.init(jax.random.split(fit_key)[0])
+        assert same(given, fits[i - 1][2] if i % 2 else new)
+        np.testing.assert_array_equal(seen, [[-1], [-0.5], [0.5], [1]])
+    assert len(fits) == 4
+    start = states[0].learner.actor
+    for i, state in enumerate(states):
+        assert same(state.learner.actor, start._replace(log_std=start.log_std + i))
+        assert [int(n) for n in (state.updates, state.searched, state.fitted)] == [i, 3 * i, 4 * i]
+    for state, (_, _, moved) in zip(states[1:], fits, strict=True):
+        assert same(state.models, moved)
 
 
 # Rounds.

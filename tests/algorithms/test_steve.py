@@ -235,6 +235,21 @@ def test_each_model_and_critic_learns_from_rows_of_its_own(
         assert same(*[jax.tree.map(lambda x, i=index: x[i], c) for c in (one, two)]) != moved
 
 
+@pytest.mark.parametrize(("name", "twins"), [("steve", 1), ("steve-td3", 2)])
+def test_a_critic_step_leaves_the_rows_of_others_out(name: str, twins: int) -> None:
+    """Other rewards in row 1 change member 1 alone, and those in row 0 member 0."""
+    algorithm = learner(name, horizon=0, critic_members=2, batch_size=16, **SMALL)
+    state, step = fresh(algorithm, 3), compiled(algorithm.critic_step)
+    plain = step(state, rows(16), KEY)[0].critic
+    for row in (0, 1):
+        other = rows(16)
+        other.reward[row] += 100
+        critic = step(state, other, KEY)[0].critic
+        for index in range(2 * twins):
+            pair = [jax.tree.map(lambda x, i=index: x[i], c) for c in (plain, critic)]
+            assert same(*pair) == (index // twins != row)
+
+
 def test_every_row_is_dealt_to_a_model() -> None:
     """Also where they do not divide a minibatch: each model's weighted mean is that of its rows."""
     batch = rows(8)

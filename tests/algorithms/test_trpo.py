@@ -393,6 +393,22 @@ def test_budget_is_made_exactly(steps: int, runs: Path) -> None:
     assert last["critic_updates"] == steps // 60 * 20 * 3
 
 
+def test_every_update_has_a_number_of_its_own(runs: Path) -> None:
+    """Which its random key is made of."""
+    settings = {**RUN, "rollout_length": 4, "steps": 36}
+    trainer = Trainer("trpo", "probe_envs:Scripted-v0", runs=runs, **settings)
+    compiled, numbers = trainer.loop.learners.compiled, list[int]()
+    update = compiled.update
+
+    def watched(state: Any, member: int, number: int, *rest: Any) -> Any:
+        numbers.append(number)
+        return update(state, member, number, *rest)
+
+    compiled.update = watched  # type: ignore[method-assign]
+    run_to_end(trainer)
+    assert numbers == [0, 1, 2]
+
+
 def test_rollout_follows_each_env_in_time(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Corridor observes how many steps an episode has: 0, 1, 2, 0, ... in each env's column."""
     kwargs = {"max_episode_steps": 3}

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
+from scripted_runs import IDLE, script, start
 from short_runs import TINY, content, run_to_end
 
 from pacesetter.batch import Layout, Spec, Transition
@@ -384,13 +385,35 @@ def test_cycles_of_all_members_are_drawn_before_any_error_returns(runs: Path) ->
     assert len(calls) == 40
 
 
-def test_horizon_is_set_at_the_start(runs: Path) -> None:
-    """The budget of the first start, whatever a resume allows; and beta follows it."""
-    settings: dict[str, Any] = {**TINY, "steps": 200, "replay": "prioritized"}
-    trainer = Trainer("td3", CORRIDOR, runs=runs, env_kwargs={"cut_at": 10}, **settings)
-    run_to_end(trainer)
-    trainer = Trainer.resume(trainer.directory.path, steps=400)
-    assert trainer.directory.settings()["replay_horizon"] == 200
+def scores(trainer: Trainer) -> list[float | None]:
+    """What each row of a run of 50 steps is ranked by, None where it is not known."""
+    while trainer.progress.step < 50:
+        trainer.loop.tick()
+    sampler: Any = trainer.loop.replays[0].sampler
+    found = [None if np.isnan(score) else float(score) for score in sampler.scores[:50]]
+    trainer.close()
+    return found
+
+
+def test_rows_of_a_run_have_the_return_of_their_episode(runs: Path) -> None:
+    """Members 0 and 1 in turn, two episodes each, and five steps of a third."""
+    trainer = start(runs, ([3, 4], [5, 6]), replay="return", steps=50, **IDLE)
+    assert scores(trainer) == [3, 5] * 10 + [4, 6] * 10 + [None] * 10
+
+
+def test_rows_of_a_run_have_their_return_to_go(runs: Path) -> None:
+    """A step pays 1, so that of an episode of 10 steps 10, 9, ... are to come; of one of 6, 6."""
+    settings: dict[str, Any] = {**TINY, "warmup": 0, "steps": 50, "wait": False, **IDLE}
+    trainer = Trainer("multi-td3", CORRIDOR, runs=runs, replay="return", replay_to_go=True,
+                      env_kwargs={"cut_at": 10}, **settings)  # fmt: skip
+    script(trainer.loop.explorers[1].env, cut_at=6)
+    first = [10 - n % 10 if n < 20 else None for n in range(25)]
+    second = [6 - n % 6 if n < 24 else None for n in range(25)]
+    assert scores(trainer) == [score for pair in zip(first, second, strict=True) for score in pair]
+
+
+def watch(trainer: Trainer) -> list[float]:
+    """The share of the horizon at each sample of a run."""
     seen: list[float] = []
     replay = trainer.loop.replays[0]
     sample = replay.sample
@@ -400,7 +423,21 @@ def test_horizon_is_set_at_the_start(runs: Path) -> None:
         return sample(rng, shape, done)
 
     replay.sample = watched  # type: ignore[method-assign]
+    return seen
+
+
+def test_horizon_is_set_at_the_start(runs: Path) -> None:
+    """The budget of the first start, whatever a resume allows; and beta follows it."""
+    settings: dict[str, Any] = {**TINY, "steps": 200, "replay": "prioritized"}
+    trainer = Trainer("td3", CORRIDOR, runs=runs, env_kwargs={"cut_at": 10}, **settings)
+    seen = watch(trainer)
     run_to_end(trainer)
+    assert seen == [step / 200 for step in range(102, 201, 2)]  # two updates a call
+    trainer = Trainer.resume(trainer.directory.path, steps=400)
+    assert trainer.directory.settings()["replay_horizon"] == 200
+    seen = watch(trainer)
+    run_to_end(trainer)
+    assert len(seen) == 100
     assert set(seen) == {1.0}
     values = content(trainer.directory)["arrays"]["replay.0.values"]
     assert values.shape == (400,)

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from scripted_runs import start
 from short_runs import TINY, assert_same, log, run_to_end
 from stopping import stop_at
 
@@ -56,6 +57,18 @@ def test_every_member_starts_with_the_champion_of_a_run(runs: Path, algorithm: s
     assert same(old.loop.parts()["normalizer"].arrays(), new.loop.parts()["normalizer"].arrays())
     assert new.progress.step == 0
     run_to_end(new)
+
+
+def test_it_is_the_champion_of_several_members(runs: Path) -> None:
+    """Member 1, which has learned on its own since the selection at step 20."""
+    old = start(runs, ([3], [5]), steps=30)
+    run_to_end(old)
+    assert old.progress.champion == 1
+    other, champion = old.loop.learners.states
+    assert not same(other.actor, champion.actor)
+    new = start(runs, ([3], [5]), name="new", start_from=str(old.directory.path))
+    assert all(same(champion, state) for state in new.loop.learners.states)
+    new.close()
 
 
 def test_the_ledger_starts_anew(runs: Path) -> None:
