@@ -89,9 +89,10 @@ class RLTools:
         self.num_timesteps, self.batch_size = 0, 100
         space: Any = gymnasium.make(env).action_space
         self.low, self.high = space.low, space.high
+        name = f"peers_{os.getpid()}"  # compiled below it, and with sizes of the task inside
         networks = {"ACTOR_HIDDEN_DIM": 256, "CRITIC_HIDDEN_DIM": 256}
         self.state = TD3(
-            task, enable_evaluation=False, STEP_LIMIT=steps + 1, interface_name="peers", **networks
+            task, enable_evaluation=False, STEP_LIMIT=steps + 1, interface_name=name, **networks
         ).State(seed)
 
     @property

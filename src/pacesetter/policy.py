@@ -147,9 +147,10 @@ def file_of(name: str | Path) -> Path | None:
 def load(path: str | Path) -> Policy:
     """The policy of a file, of a run's folder, or `champion:NAME`; nothing in it is executed."""
     path = file_of(path) or Path(path)
+    # A person, or the hub's cache, may name a link; of a run's folder the file is its own.
+    path = path.resolve() if path.is_symlink() else path
     path = path / "policy.safetensors" if path.is_dir() else path
-    # A person, or the hub's cache, may name a link.
-    arrays, table = storage.read(path.resolve() if path.is_symlink() else path, KIND)
+    arrays, table = storage.read(path, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
             f"{path}: policy schema {table.get('schema')}; this version reads {SCHEMA}; "

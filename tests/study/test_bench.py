@@ -449,27 +449,6 @@ def test_run_of_another_machine_is_not_failed(
     assert any("process 1 on elsewhere" in x and f"remove {lock};" in x for x in work.news)
 
 
-def test_own_run_that_died_on_another_machine_is_tried_again(
-    jobs: list[Job], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The text of its lock stays, and this bench has seen it end: no reason to wait for ever."""
-
-    def no_locks(*arguments: Any) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    monkeypatch.setattr(fcntl, "flock", no_locks)
-    lock = jobs[0].directory.path / "lock"
-
-    def killed(words: list[str]) -> int:
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        lock.write_text("process 1 on elsewhere\n")
-        return -9
-
-    work = run(jobs[:1], executor := Here(killed, main, main))
-    assert len(executor.calls) == RETRIES + 1
-    assert work.failed == {str(jobs[0]): "exit 75: the fault"}
-
-
 def test_a_quiet_bench_names_the_run_that_it_waits_for(
     jobs: list[Job], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,6 @@
 """The first sentence of a comparison: who is ahead, and whether the runs can tell."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -84,7 +85,7 @@ def test_a_control_that_made_no_update_is_still_among_the_runs(tmp_path: Path) -
         if path.parts[-3] != "td3":
             path.write_text(path.read_text().replace('"updates": 0', '"updates": 9'))
     line = headline(compare([tmp_path], budget="20k"))
-    assert "sac on 2; td3 has no known return, so no difference is tested." in line
+    assert "sac on 2; td3 has no known return beside another's, so no difference is tested." in line
     (tmp_path / "alone").mkdir()
     for env in ("Ant-v5", "Walker2d-v5"):
         for name in ("td3", "sac"):
@@ -92,6 +93,15 @@ def test_a_control_that_made_no_update_is_still_among_the_runs(tmp_path: Path) -
     line = headline(compare([tmp_path / "alone"], budget="20k"))
     assert line.startswith("sac was run on 2 tasks, beside none whose return is known.")
     assert "td3 on Ant-v5, td3 on Walker2d-v5." in line
+    alone = tmp_path / "alone"
+    for path in (
+        *alone.glob("Ant-v5-td3/*/metrics.jsonl"),
+        *alone.glob("Ant-v5-sac/*/metrics.jsonl"),
+    ):
+        made = "9" if "td3" in str(path.parts[-3]) else "0"
+        path.write_text(re.sub(r'"updates": [09]', f'"updates": {made}', path.read_text()))
+    line = headline(compare([alone], budget="20k"))
+    assert "td3 has no known return beside another's" in line, "on either task"
 
 
 def test_who_made_no_update_is_not_ahead(tmp_path: Path) -> None:

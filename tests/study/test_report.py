@@ -233,11 +233,15 @@ def test_the_interval_of_two_seeds_does_not_flatten_the_curves(
     assert high == pytest.approx(means.max() + height)
     write(tmp_path / "report.html", tmp_path, "--no-film")
     browser.get((tmp_path / "report.html").as_uri())
-    script = "return document.querySelector('figure.chart path[fill-opacity]').getBBox()"
-    band = browser.execute_script(script)
-    svg = browser.execute_script("return document.querySelector('figure.chart svg').clientHeight")
-    assert band["y"] > 0
-    assert band["y"] + band["height"] < svg - 20
+    script = "return document.querySelector(arguments[0]).getBBox().height"
+    band, mean = (
+        browser.execute_script(script, f"figure.chart {part}")
+        for part in ("svg.panel path", "path[fill=none]")
+    )
+    panel = "return document.querySelector('svg.panel').height.baseVal.value"
+    plot = browser.execute_script(panel)
+    assert band > 2 * plot, "the rest is cut"
+    assert plot > mean > plot / 4
 
 
 def test_every_control_is_reached_by_tab(opened: Any) -> None:

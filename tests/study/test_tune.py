@@ -362,6 +362,11 @@ def test_two_studies_do_not_share_their_best_settings() -> None:
     study(file="other")
     with pytest.raises(UsageError, match="other has the same"):
         study(file="other.log")
+    Path("mine").write_text("a script")
+    Path("errors.log").touch()  # as a shell makes it for `2> errors.log`
+    assert [study(file=name).file.name for name in ("mine.log", "errors")] == ["mine.log", "errors"]
+    Path("sweep").write_bytes(Path("sweep.log").read_bytes())  # of an earlier version
+    study(file="sweep")
 
 
 @pytest.mark.parametrize("value", [None, [None], {"a": [1, None]}])

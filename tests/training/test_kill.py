@@ -301,10 +301,12 @@ def test_run_that_gets_a_limit_when_it_is_resumed(
     again = ["resume", str(directory.path), "-q", "--allow=broken_envs:Hangs-v0"]
     assert main([*again, "--env-timeout", "soon"]) == 2
     assert "env_timeout" in capsys.readouterr().err
-    assert main([*again, "--env-timeout", "1s", "--checkpoint-every", "5m"]) == 1
+    device = ["--device", "cpu"]
+    assert main([*again, "--env-timeout", "1s", "--checkpoint-every", "5m", *device]) == 1
     assert "the limit of --env-timeout" in capsys.readouterr().err
     assert directory.settings()["env_timeout"] == 1
     assert directory.settings()["checkpoint_every"] == 300
+    assert directory.settings()["device"] == "cpu"
     assert saved_step(directory) == 148  # a step of its life was the test at the start
 
 

@@ -56,7 +56,8 @@ class Hyper(ModelDriven, trpo.Hyper):
     )
     model_batch_size: SmallCount = Field(1000, description="rows per minibatch of a model")
     model_patience: SmallCount = Field(
-        5, description="passes over the data without a lower held-out loss before a fit ends"
+        5,
+        description="passes without a fall of the held-out loss by 1% that end a fit",
     )
     model_rows: Count = Field(
         250_000,

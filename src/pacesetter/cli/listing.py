@@ -110,7 +110,7 @@ LISTS: dict[str, Callable[[], list[Row]]] = {
 }
 HINTS = {
     "envs": (
-        "any other Gymnasium id with a vector of numbers as observation and bounded continuous "
+        "any other Gymnasium id with observations of numbers (no images) and bounded float "
         "actions, or module:Id-v0"
     )
 }

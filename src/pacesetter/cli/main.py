@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"pacesetter: stopped: {error}", file=sys.stderr)
         return error.code
     except MemoryError as error:
-        less = "lower --members, --batch-size or --replay-size"
+        less = "ask for less, such as fewer members or a smaller batch"
         print(f"pacesetter: stopped: out of memory: {error}; {less}", file=sys.stderr)
         return 1
     except Interrupted as signal:

@@ -82,7 +82,8 @@ def to_sb3(
     while not given[-1]:
         given.pop()
     words = ", ".join(map(repr, given))
-    imports = "from math import inf\n" if "inf" in words else ""  # as `repr` writes Infinity
+    odd = [name for name in ("inf", "nan") if name in words]  # as `repr` writes such numbers
+    imports = f"from math import {', '.join(odd)}\n" if odd else ""
     text = SCRIPT.format(task=words, imports=imports)
     try:
         policy.save(file)

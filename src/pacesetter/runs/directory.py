@@ -28,7 +28,7 @@ from pacesetter.runs.records import SCHEMA, check_record
 from pacesetter.settings.validation import difference
 
 CONFIG = "config.json"
-# Settings that change no result, which `resume` takes anew.
+# Settings that belong to the machine, not to the result; `resume` takes them anew.
 WITHOUT_RESULT = {"checkpoint_every", "device", "env_timeout"}
 # Settings in which the seeds of one name may differ.
 HORIZONS = {"replay_horizon", "lr_horizon"}
@@ -253,6 +253,6 @@ class RunDirectory:
         """Whether a process holds the folder now."""
         return self._lock.is_held()
 
-    def holder(self, doubtful: bool = True) -> str | None:
+    def holder(self) -> str | None:
         """Who holds the folder now, as `Lock.holder` tells."""
-        return self._lock.holder(doubtful)
+        return self._lock.holder()

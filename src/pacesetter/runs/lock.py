@@ -77,18 +77,18 @@ class Lock:
         """Whether a process holds the file now, or may, as `holder` says."""
         return self.holder() is not None
 
-    def holder(self, doubtful: bool = True) -> str | None:
+    def holder(self) -> str | None:
         """Who holds the file now, for people; None if nobody does or it cannot be read.
 
         Of a process of another machine, on a file system without locks, nobody here can tell
-        whether it lives; it counts only if `doubtful`.
+        whether it lives; it counts.
         """
         try:
             with _open(self.path, "r") as file:
                 if _flock(file, fcntl.LOCK_SH):
                     return None
                 text = _text(file)
-                return text if _lives(text) else self._elsewhere(text) if doubtful else None
+                return text if _lives(text) else self._elsewhere(text)
         except BlockingIOError:
             return self._named()
         except OSError:

@@ -247,7 +247,7 @@ class RunSettings(TypedDict, total=False):
     model_batch_size: int
     """rows per minibatch of a model"""
     model_patience: int
-    """passes over the data without a lower held-out loss before a fit ends"""
+    """passes without a fall of the held-out loss by 1% that end a fit"""
     model_rows: int | str
     """rows that all passes of one fit may go through together"""
     renew_every: int

@@ -113,7 +113,7 @@ def _restore(
         notes.append(
             f"made with {table['threads']} threads, going on with {threads()}: "
             "results will differ in their last bits; "
-            f"NPROC={table['threads']} keeps them equal"
+            f"in Python, NPROC={table['threads']} keeps them equal"
         )
     made_by, now_by = table.get("products", "xla"), products.of(config.hyper)
     if made_by != now_by and loop.progress.step < loop.budget:

@@ -64,6 +64,15 @@ def refuse_other_settings(config: Config, directory: RunDirectory) -> None:
         return
 
 
+def device_notes(directory: RunDirectory, now: str) -> list[str]:
+    """A line if the run was last made on another kind of device than it is now."""
+    record = directory.record()
+    before = [record, *record.get("resumed", [])][-1].get("backend", now)
+    if before == now:
+        return []
+    return [f"made on {before}, going on with {now}: results will differ in their last bits"]
+
+
 def refuse_strangers(file: Path, table: dict[str, Any], config: Config) -> None:
     """Refuse a checkpoint of another schema or of another run."""
     schema = table.get("schema")

@@ -122,6 +122,7 @@ class Trainer:
             notes = checkpoint.restore(self.loop, self.config, self.directory)
             if not begun:
                 start_from(self.loop, self.config, runs)
+            self.notes += identity.device_notes(self.directory, self._made_with["backend"])
             self.notes += [*self.directory.notes, *notes]
             if self.progress.step > self.budget:
                 raise UsageError(f"steps: the run has made {self.progress.step:,}; give more")

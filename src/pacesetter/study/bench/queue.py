@@ -104,7 +104,6 @@ class Bench:
         self._waiting = deque(job for job, over in zip(whole, done, strict=True) if not over)
         self._failures: Counter[str] = Counter()
         self.aside: dict[str, str] = {}  # who holds the runs that wait for another process
-        self._ended: set[str] = set()  # jobs of which a process of this bench has ended
         self._stopping = False
 
     def stop(self) -> None:
@@ -151,7 +150,7 @@ class Bench:
         for slot in set(range(executor.slots)) - self.running.keys():
             for _ in range(len(self._waiting)):
                 job = self._waiting.popleft()
-                if holder := self._holder(job):  # another bench, or the run of a killed one
+                if holder := job.directory.holder():  # another bench, or the run of a killed one
                     self._set_aside(job, holder)
                 elif is_finished(job):
                     self._finish(job)
@@ -166,12 +165,11 @@ class Bench:
             outcome = executor.poll(task)
             if outcome is not None:
                 del self.running[slot]
-                self._ended.add(str(job))
                 self._end(job, words, outcome, stopped)
 
     def _end(self, job: Job, words: list[str], outcome: Outcome, stopped: bool) -> None:
         overtaken = words[0] == "train" and files.present(job.directory.config_file)
-        holder = self._holder(job) if outcome.code == IN_USE else None
+        holder = job.directory.holder() if outcome.code == IN_USE else None
         if is_finished(job):
             self._finish(job)
         elif stopped:
@@ -186,10 +184,6 @@ class Bench:
             self._failures[str(job)] += 1
             self._waiting.append(job)
             self.news.append(f"{job}: failed, {_last_line(outcome)}; trying again")
-
-    def _holder(self, job: Job) -> str | None:
-        """Who holds the run; not a process of this bench that has ended and could not say so."""
-        return job.directory.holder(doubtful=str(job) not in self._ended)
 
     def _set_aside(self, job: Job, holder: str) -> None:
         self._waiting.append(job)

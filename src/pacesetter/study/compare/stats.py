@@ -18,7 +18,7 @@ scipy: Any = scipy_stats
 
 CONFIDENCE = 0.95
 FEWEST_SEEDS = 5  # below, a result is called indicative
-BOOTSTRAP_SEEDS = 10  # below, a nominal 95% covers less: BCa .88 at 5 seeds, .907 at 10
+BOOTSTRAP_SEEDS = 10  # below, a nominal 95% covers less: benchmarks/intervals.py
 FEWEST_EVALUATIONS = 3  # behind a final return; a run of fewer is told apart
 FEWEST_CHANCES = 3  # runs a side behind a probability: of one a side it is 0 or 1
 RESAMPLES = 10_000

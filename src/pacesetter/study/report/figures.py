@@ -19,6 +19,7 @@ from pacesetter.study.report.paper import TASKS
 from pacesetter.study.report.tables import steps
 
 COLUMNS = 3
+BAND = "95% t interval (cut where far wider)"
 FIGURE_2 = (("multi-td3", "sunrise"), ("multi-td3", "td3"))
 Styles = Mapping[str, tuple[str, str]]
 
@@ -56,7 +57,7 @@ def picture(comparison: Comparison, path: Path, window: int | None = None) -> No
         _intervals(below, comparison, env)
         above.set_visible(True)
         below.set_visible(True)
-    _head(figure, f"{title(comparison)}: mean over seeds and 95% t interval{_smoothed(window)}")
+    _head(figure, f"{title(comparison)}: mean over seeds and {BAND}{_smoothed(window)}")
     about = {"Date": None} if path.suffix == ".svg" else {}
     with matplotlib.rc_context({"svg.hashsalt": "pacesetter"}):
         figure.savefig(path, dpi=150, metadata=about)
@@ -96,7 +97,7 @@ def page(comparison: Comparison, axis: str, window: int | None = None) -> Any:
     figure, panels = _panels(len(comparison.envs))
     for env, panel in zip(comparison.envs, panels, strict=True):
         _curves(panel, comparison, env, axis, window)
-    _head(figure, f"Mean over seeds and 95% t interval{_smoothed(window)}")
+    _head(figure, f"Mean over seeds and {BAND}{_smoothed(window)}")
     return figure
 
 

@@ -22,8 +22,7 @@ def headline(comparison: Comparison) -> str:
     unknown = [f"{x.name} on {x.env}" for x in comparison.groups if x not in known]
     more = f"; and {len(unknown) - MOST} more" if len(unknown) > MOST else ""
     rest = f" Not known, without an evaluation after the first update: {', '.join(unknown[:MOST])}"
-    names = {group.name for group in comparison.groups}
-    sentence = _sentence(replace(comparison, groups=known), names)
+    sentence = _sentence(replace(comparison, groups=known), comparison)
     return f"{sentence}{rest}{more}." if unknown else sentence
 
 
@@ -33,13 +32,13 @@ def _is_known(group: Group, metric: str) -> bool:
     return learned and bool(np.isfinite(group.values(metric)).all())
 
 
-def _sentence(comparison: Comparison, names: set[str]) -> str:
-    """Of the groups that are known; `names` are those of all algorithms."""
+def _sentence(comparison: Comparison, every: Comparison) -> str:
+    """Of the groups that are known, out of `every` one."""
     if len(comparison.groups) == 1:
         return _alone(comparison.groups[0], comparison.metric)
     if len(comparison.envs) == 1:
         return _best(comparison)
-    return _tally(comparison) or _leaders(comparison, names)
+    return _tally(comparison) or _leaders(comparison, every)
 
 
 def _alone(group: Group, metric: str) -> str:
@@ -108,12 +107,12 @@ def _places(counts: list[int]) -> str:
     return " and ".join(found)
 
 
-def _leaders(comparison: Comparison, every: set[str]) -> str:
+def _leaders(comparison: Comparison, every: Comparison) -> str:
     """How many tasks each algorithm leads, where no task has the control beside another."""
     metric, led = comparison.metric, dict[str, int]()
     names = {group.name for group in comparison.groups}
     if len(names) == 1:
-        beside = "no other algorithm" if len(every) == 1 else "none whose return is known"
+        beside = "no other algorithm" if every.names == [*names] else "none whose return is known"
         return f"{names.pop()} was run on {len(comparison.envs)} tasks, beside {beside}."
     for env in comparison.envs:
         groups = [group for group in comparison.groups if group.env == env]
@@ -121,12 +120,14 @@ def _leaders(comparison: Comparison, every: set[str]) -> str:
         led[name] = led.get(name, 0) + 1
     ranked = sorted(led.items(), key=lambda item: -item[1])[:MOST]
     words = ", ".join(f"{name} on {count}" for name, count in ranked)
-    if comparison.reference in names:
-        beside = "was run beside no other"
-    elif comparison.reference in every:
-        beside = "has no known return"
-    else:
+    tasks = [[group.name for group in every.groups if group.env == env] for env in every.envs]
+    shared = [names for names in tasks if every.reference in names]
+    if not shared:
         beside = "is not among the runs"
+    elif max(map(len, shared)) == 1:
+        beside = "was run beside no other"
+    else:
+        beside = "has no known return beside another's"
     return (
         f"The highest {NAMES[metric].lower()} of {len(comparison.envs)} tasks: {words}; "
         f"{comparison.reference} {beside}, so no difference is tested."

@@ -169,11 +169,13 @@ class Chart {
 
   band(name, [xs, , low, high]) {
     if (low.some((value) => value === null)) return;
-    const y = (at) => Math.min(Math.max(this.y(at), TOP), HEIGHT - BOTTOM);
-    const there = path(xs, high, this.x, y);
-    const back = path([...xs].reverse(), [...low].reverse(), this.x, y);
+    const there = path(xs, high, this.x, this.y);
+    const back = path([...xs].reverse(), [...low].reverse(), this.x, this.y);
+    const width = this.width - LEFT - RIGHT, height = HEIGHT - TOP - BOTTOM;
+    const panel = element("svg", { x: LEFT, y: TOP, width, height, class: "panel",
+      viewBox: `${LEFT} ${TOP} ${width} ${height}` }, this.svg);  // which cuts what is outside
     element("path", { d: `${there}L${back.slice(1)}Z`, fill: data.styles[name][0],
-      "fill-opacity": 0.16 }, this.svg);
+      "fill-opacity": 0.16 }, panel);
   }
 
   follow(event) {

@@ -130,6 +130,15 @@ def refuse_foreign(file: Path) -> None:
         raise UsageError(f"study: {file} is not a study: {error}") from None
 
 
+def is_study(file: Path) -> bool:
+    """Whether a file is there that a study has begun."""
+    try:
+        refuse_foreign(file)
+        return file.stat().st_size > 0
+    except (UsageError, OSError):
+        return False
+
+
 def hold(path: Path) -> Lock | None:
     """A lock that is held now; None if another has it or may have it."""
     lock = Lock(path)

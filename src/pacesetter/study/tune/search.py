@@ -27,6 +27,7 @@ from pacesetter.study.bench.suite import TUNING_SEEDS
 from pacesetter.study.tune.journal import (
     distribution,
     hold,
+    is_study,
     open_study,
     optuna,
     ranges,
@@ -92,7 +93,7 @@ class Tuning:
         refuse_foreign(self.file)
         stem = self.file.name.removesuffix(".log")
         twin = stem if stem != self.file.name else f"{stem}.log"
-        if twin and self.file.with_name(twin).is_file():
+        if twin and not self.file.exists() and is_study(self.file.with_name(twin)):
             raise UsageError(f"study: {twin} has the same best.toml; give another --study")
         if not self.file.exists() and any(find_all(self.runs)):
             raise UsageError(
