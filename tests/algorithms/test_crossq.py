@@ -226,19 +226,26 @@ def test_actor_moves_once_in_three(rng: np.random.Generator) -> None:
     assert (int(update.state.alpha_opt_state[0].count), int(update.state.updates)) == (1, 3)
 
 
-def test_renorm_follows_the_networks_own_updates(rng: np.random.Generator) -> None:
-    """With `renorm_after` 2 and a delay of 1 the third update of each network is the first warm."""
-    batch = jax.tree.map(np.float32, random_batch(rng, SPEC, 1, 8))
-    never, soon = learner(renorm_after=10**9), learner(renorm_after=2)
-    one = other = jax.jit(never.init)(KEY)
-    steps = [jax.jit(each.update) for each in (never, soon)]
-    for i in range(3):
-        one = steps[0](one, batch, jax.random.key(i)).state
-        other = steps[1](other, batch, jax.random.key(i)).state
-        moments = [(s.actor_opt_state[0].mu, s.critic_opt_state[0].mu) for s in (one, other)]
+@pytest.mark.parametrize("delay", [1, 3])
+def test_renorm_follows_the_networks_own_updates(delay: int, rng: np.random.Generator) -> None:
+    """With `renorm_after` 2 the third update of each network is the first warm, at any delay."""
+    batch = jax.tree.map(np.float32, member(random_batch(rng, SPEC, 1, 8), 0))
+    never, soon = (learner(renorm_after=n, policy_delay=delay) for n in (10**9, 2))
+    state = jax.jit(never.init)(KEY)
+    fits = {
+        "critic": [jax.jit(each.fit_critic) for each in (never, soon)],
+        "actor": [jax.jit(each.fit_actor) for each in (never, soon)],
+    }
+    made = {"critic": 0, "actor": 0}
+    for number, name in enumerate((["critic"] * delay + ["actor"]) * 3):
+        cold, other = (fit(state, batch, jax.random.key(number))[0] for fit in fits[name])
+        moments = [getattr(one, f"{name}_opt_state")[0].mu for one in (cold, other)]
         pairs = zip(*map(jax.tree.leaves, moments), strict=True)
         equal = [np.array_equal(a, b) for a, b in pairs if np.any(a != 0)]
-        assert all(equal) if i < 2 else not any(equal)
+        assert equal
+        assert all(equal) if made[name] < 2 else not any(equal)
+        made[name] += 1
+        state = cold
 
 
 def test_learner_uses_no_key_twice(rng: np.random.Generator) -> None:

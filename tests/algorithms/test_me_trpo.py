@@ -299,6 +299,10 @@ def test_iterations_fit_from_before_or_anew_and_go_on_with_the_policy_kept(
 # Rounds.
 
 
+def test_models_learn_at_the_rate_of_the_settings() -> None:
+    assert learner(model_learning_rate=0.02).dynamics.learning_rate == 0.02
+
+
 def test_ring_is_given_whole(tmp_path: Path) -> None:
     """Rows at their number modulo the size; what was not written is 0."""
     ring = buffer.Replay(tmp_path / "ring.bin", Layout(Spec(1, 1)), 10, 1_000)

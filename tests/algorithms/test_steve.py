@@ -250,6 +250,13 @@ def test_a_critic_step_leaves_the_rows_of_others_out(name: str, twins: int) -> N
             assert same(*pair) == (index // twins != row)
 
 
+@pytest.mark.parametrize("name", ["steve", "steve-td3"])
+def test_models_learn_as_the_settings_say(name: str) -> None:
+    """Their rate and decay reach the dynamics, whose step is proved elsewhere."""
+    told = learner(name, model_learning_rate=0.02, model_decay=0.3, batch_size=16, **SMALL)
+    assert (told.dynamics.learning_rate, told.dynamics.decay) == (0.02, 0.3)
+
+
 def test_every_row_is_dealt_to_a_model() -> None:
     """Also where they do not divide a minibatch: each model's weighted mean is that of its rows."""
     batch = rows(8)
@@ -353,12 +360,15 @@ def test_sparse_exploration_is_the_published_one() -> None:
 
 
 def test_parameter_noise_adapts() -> None:
-    """As in TD3: its deviation is part of the state and of the log."""
-    noisy = {"exploration": "parameter", "actor_layer_norm": True, "exploration_noise": 0.2}
+    """As in TD3: by 1% at the 50th update, here up, since no actions are as far apart as 10."""
+    noisy = {"exploration": "parameter", "actor_layer_norm": True, "exploration_noise": 10}
     algorithm = learner("steve-td3", batch_size=8, **noisy, **SMALL)
-    state = jax.eval_shape(algorithm.init, KEY)
-    found = jax.eval_shape(algorithm.update, state, rows(2, 8), KEY)
-    assert found.state.exploration.shape == found.losses["sigma"].shape == ()
+    update, sigma = compiled(algorithm.update), np.float32(0.2)
+    for made, factor in ((46, 1), (48, 1.01)):
+        state = fresh(algorithm, 3)._replace(updates=np.int32(made), exploration=sigma)
+        found = update(state, rows(2, 8), KEY)
+        assert found.state.exploration == found.losses["sigma"]
+        np.testing.assert_allclose(found.losses["sigma"], sigma * factor, rtol=1e-6)
 
 
 def test_settings_that_cannot_work_are_refused() -> None:

@@ -56,7 +56,7 @@ def minibatches(cycle: int, rows: int, mask: Any, seed: int = 0) -> Batch:
     """Random transitions (cycle, rows), all with the same masks (rows, N)."""
     batch = single(random_batch(np.random.default_rng(seed), SPEC, cycle, rows))
     mask = np.broadcast_to(np.float32(mask), (cycle, rows, np.shape(mask)[-1]))
-    return batch._replace(weight=np.ones((cycle, rows), np.float32), mask=mask)
+    return batch._replace(mask=mask)
 
 
 def leaves(tree: Any) -> list[Any]:
@@ -113,7 +113,7 @@ def test_official_gradients_are_a_row_short(name: str) -> None:
         found = update(ours, state, batch, KEY).state
         alone = update(base, member(state, 0), batch, KEY).state
         moments = [field for field in found._fields if field.endswith("_opt_state")]
-        assert len(moments) == 3 if name == "sunrise" else 2
+        assert len(moments) == (3 if name == "sunrise" else 2)
         for field in moments:
             pairs = zip(firsts(getattr(found, field)), firsts(getattr(alone, field)), strict=True)
             for one, other in pairs:

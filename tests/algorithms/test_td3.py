@@ -633,6 +633,16 @@ def test_nothing_is_nan(name: str, settings: dict[str, Any], runs: Path, nans_ra
     assert all(state.updates >= 20 for state in trainer.loop.learners.states)
 
 
+@pytest.mark.parametrize(("also", "updates"), [(False, 50), (True, 100)])
+def test_the_warmup_can_be_learned_from_as_it_goes(also: bool, updates: int, runs: Path) -> None:
+    """With `warmup_updates` every step has its update; the first 50 actions are random still."""
+    settings = {**TINY, "warmup": 50, "steps": 100, "warmup_updates": also}
+    trainer = Trainer("td3", "probe_envs:Scripted-v0", runs=runs, **settings)
+    assert run_to_end(trainer).rows()[-1]["updates"] == updates
+    assert trainer.loop.learners.states[0].updates == updates
+    assert trainer.progress.members[0].actions == 50
+
+
 # Learning a walker's task; in so few steps HalfCheetah is not learned with every seed.
 
 

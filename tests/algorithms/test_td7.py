@@ -175,7 +175,8 @@ class Reference:
             self.critic_step(batch, self.target(batch, draw))
             self.updates += 1
         self.actor_step(member(batches, len(noise) - 1))
-        if self.updates % self.hyper.copy_every == 0:
+        since = range(self.updates - len(noise) + 1, self.updates + 1)
+        if any(update % self.hyper.copy_every == 0 for update in since):
             nets = self.nets
             nets["target_actor"], nets["target_critic"] = nets["actor"], nets["critic"]
             nets["target_encoder"] = nets["fixed_encoder"]
@@ -235,6 +236,7 @@ CASES: dict[str, dict[str, Any]] = {
     "td7": {},
     "three-critics": {"policy_delay": 3, "critics": 3, "target_noise": 0.0, "copy_every": 6},
     "uniform": {"replay": "uniform"},
+    "copies-within-cycles": {"policy_delay": 3, "copy_every": 4},
 }
 
 

@@ -139,6 +139,25 @@ def test_average_weights_the_better_half_alike(returns: Any) -> None:
         assert set(row[kept]) == {1 / half}
 
 
+@given(returns=st.permutations(range(10)), seed=SEEDS)
+def test_pbt_moves_the_worst_fifth_to_the_best_fifth(returns: Any, seed: int) -> None:
+    """Of ten members exactly the two worst, and only they are perturbed."""
+    rng = np.random.default_rng(seed)
+    parents, _, _, perturb = choose("pbt", window(np.array(returns, float)), rng)
+    assert perturb is not None
+    for k, value in enumerate(returns):
+        assert perturb[k] == (value < 2)
+        assert (returns[parents[k]] >= 8) if value < 2 else (parents[k] == k)
+
+
+def test_pbt_draws_both_of_the_best_fifth() -> None:
+    """Each of the two worst draws on its own: 4 outcomes, each in a quarter of 2000 draws."""
+    rng, returns = np.random.default_rng(0), window(np.arange(10.0))
+    drawn = [tuple(choose("pbt", returns, rng).parents[:2].tolist()) for _ in range(2000)]
+    for pair in ((8, 8), (8, 9), (9, 8), (9, 9)):
+        assert abs(drawn.count(pair) - 500) < 5 * (2000 * 3 / 16) ** 0.5
+
+
 @pytest.mark.parametrize("rule", [rule for rule in RULES if rule not in ("random", "rescue")])
 @given(returns=DISTINCT, order=st.data())
 def test_means_of_the_window_decide(rule: str, returns: Any, order: st.DataObject) -> None:

@@ -1,5 +1,9 @@
 """What numbers depend on is the same in every process, and on record."""
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +26,20 @@ OTHER: dict[str, Any] = {
 }
 
 
+DEFAULTS = """
+import json, sys, jax
+print(json.dumps({name: jax.config.values[name] for name in sys.argv[1:]}))
+"""
+
+
 def test_defaults_are_those_of_jax() -> None:
-    """So that holding them fast changed no run, and a JAX with others is noticed."""
-    assert {name: jax.config.values[name] for name in NUMERICS} == NUMERICS
+    """So that holding them fast changed no run, and a JAX with others is noticed; in a process of
+    its own, since this one is prepared already.
+    """
+    untold = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    words = [sys.executable, "-c", DEFAULTS, *NUMERICS]
+    done = subprocess.run(words, env=untold, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == NUMERICS
 
 
 def test_settings_of_this_process_change_no_run(tmp_path: Path) -> None:

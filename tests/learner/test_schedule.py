@@ -30,6 +30,12 @@ def test_the_horizon_is_what_a_member_updates_over_the_budget() -> None:
     assert config.lr_updates == 80
 
 
+def test_updates_of_the_warmup_are_in_the_horizon() -> None:
+    """Nothing is idle then: steps / members, by hand."""
+    settings = {"steps": 1100, "warmup": 100, "warmup_updates": True, "lr_end": 0.5}
+    assert resolve("multi-td3", "Pendulum-v1", settings).lr_updates == 550
+
+
 def test_at_zero_nothing_moves(runs: Path) -> None:
     """Rates are 0 from the horizon on, while targets still follow their networks."""
     settings = {**TINY, "steps": 400, "lr_end": 0.0, "lr_horizon": 200, "tau": 1.0}

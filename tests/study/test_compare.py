@@ -24,7 +24,7 @@ from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import lineage, stats
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.gathering import gather
-from pacesetter.study.compare.groups import split
+from pacesetter.study.compare.groups import Comparison, split
 from pacesetter.study.compare.results import compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
@@ -379,6 +379,51 @@ def test_tables_hold_the_statistics_of_the_rows(runs: Path) -> None:
     assert [row[1].text for row in control] == ["multi-td3", "sac"] * 2
 
 
+def wins(x: Any, y: Any) -> float:
+    """Share of the pairs of runs in which x is above y."""
+    return float(np.mean([one > other for one in x for other in y]))
+
+
+def test_contrasts_are_what_the_algorithm_has_more_than_the_control(runs: Path) -> None:
+    """Positive where it is better, in percent of the control's mean; by loops over all pairs."""
+    found = compare([runs])
+    values = {(group.env, group.name): group.values("final") for group in found.groups}
+    (against,) = contrasts.against(found)
+    for row in against.rows:
+        env, name = row[0].text, row[1].text
+        x, y = values[env, name], values[env, "td3"]
+        gap, welch = x.mean() - y.mean(), stats.difference(x, y)
+        assert (gap > 0) == (name == "sac")
+        assert row[2].text == f"{gap:,.0f} [{welch.low:,.0f}; {welch.high:,.0f}]"
+        assert welch.low < gap < welch.high
+        assert row[3].text == f"{100 * (x.mean() / y.mean() - 1):,.1f}%"
+        assert row[4].key == wins(x, y) != 0.5
+        spread = (stats.deviation(x), stats.deviation(y))
+        seeds = [stats.seeds_needed(e * y.mean(), spread) for e in (gap / y.mean(), 0.1, 0.2, 0.3)]
+        assert [cell.key for cell in row[5:]] == seeds
+    (together,) = contrasts.together(found)
+    for row in together.rows:
+        if (name := row[0].text) != "td3":
+            chances = [wins(values[env, name], values[env, "td3"]) for env in found.envs]
+            assert row[4].key == pytest.approx(np.mean(chances))
+            assert (np.mean(chances) > 0.5) == (name == "sac")
+
+
+def test_percents_of_a_negative_control_keep_their_sign(tmp_path: Path) -> None:
+    """Half of a penalty is 50% better."""
+    for name, level in (("td3", 4_000), ("sac", 2_000)):
+        path = small(tmp_path, name=name, level=level)
+        rows = RunDirectory(path).rows()
+        for row in (row for row in rows if row["kind"] == "eval"):
+            row["returns"] = [-value for value in row["returns"]]
+        (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = compare([tmp_path])
+    x, y = (_finals(found, "Ant-v5", name)[0] for name in ("sac", "td3"))
+    (row,) = contrasts.against(found)[0].rows
+    assert row[3].text == f"{100 * (1 - x / y):,.1f}%"
+    assert y < x < 0
+
+
 def test_max_and_levels_ignore_policies_that_have_learned_nothing(tmp_path: Path) -> None:
     """Ant's untrained policy stands still for a return of 1,000."""
     path = make_run(tmp_path, "Ant-v5", budget=100_000, evaluations=20, level=500)
@@ -592,6 +637,12 @@ def test_files_are_written_in_each_form(runs: Path, tmp_path: Path, command: Any
     assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") == 7
 
 
+def _finals(found: Comparison, env: str, name: str) -> Any:
+    group = found.find(env, name)
+    assert group is not None
+    return group.values("final")
+
+
 def test_data_and_pictures(runs: Path, command: Any) -> None:
     """JSON and CSV hold the numbers of the tables; PNG and SVG show every algorithm and task."""
     found = compare([runs])
@@ -611,6 +662,14 @@ def test_data_and_pictures(runs: Path, command: Any) -> None:
         returns = one["runs"][0]["evaluations"]["return"]
         assert returns == group.runs[0].returns.tolist()
         assert (one["difference"] is None) == (group.name == "td3") == (row["difference"] == "")
+        if group.name != "td3":
+            x, y = (_finals(found, group.env, name) for name in (group.name, "td3"))
+            said = stats.difference(x, y)._asdict() | {"p_better": wins(x, y)}
+            assert one["difference"] == said
+            columns = {"value": row["difference"]}
+            columns |= {key: row[f"difference_{key}"] for key in ("low", "high", "p_better")}
+            assert {key: float(text) for key, text in columns.items()} == said
+            assert (said["value"] > 0) == (said["p_better"] > 0.5) == (group.name == "sac")
     assert Path("a.png").read_bytes().startswith(b"\x89PNG")
     svg = Path("a.svg").read_text()
     assert svg.count('<g id="axes_') == 2 * len(found.envs)

@@ -39,10 +39,21 @@ def test_reached_is_the_first_evaluation_at_the_level() -> None:
 def test_smoothing_keeps_cubics_and_short_curves() -> None:
     x = np.linspace(-1, 1, 30)
     assert stats.smooth(x**3 - x, 11) == pytest.approx(x**3 - x)
-    assert stats.smooth(x[:3], 11) is not None
     np.testing.assert_array_equal(stats.smooth(numbers(1, 5, 2), 11), [1, 5, 2])
     rough = np.tile([0.0, 1.0], 15)
     assert np.ptp(stats.smooth(rough, 11)[5:-5]) < 0.5 < np.ptp(rough)
+
+
+@pytest.mark.parametrize(("points", "window", "used"), [(30, 9, 9), (8, 11, 7), (7, 11, 7)])
+def test_smoothing_is_a_cubic_fit_around_each_point(points: int, window: int, used: int) -> None:
+    """By least squares; a curve shorter than the window has the largest odd one that fits."""
+    values, half = np.random.default_rng(2).normal(size=points), used // 2
+    expected: list[float] = []
+    for at in range(points):
+        first = min(max(at - half, 0), points - used)  # at the ends the last whole window counts
+        places = np.arange(first, first + used)
+        expected.append(np.polyval(np.polyfit(places - at, values[places], 3), 0))
+    assert stats.smooth(values, window) == pytest.approx(np.array(expected))
 
 
 def test_mean_has_students_interval() -> None:
