@@ -214,13 +214,6 @@ FAULTS = {
 }
 
 
-@pytest.fixture
-def disarmed() -> Iterator[None]:
-    """No task of this test fails after it."""
-    yield
-    Late.disarm()
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
     """The run of `late` when nothing fails."""
