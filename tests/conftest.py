@@ -6,6 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from broken_envs import Late
 
 from pacesetter.learner.backend import prepare
 
@@ -20,6 +21,13 @@ def _keep_compiled() -> None:
 def runs(tmp_path: Path) -> Path:
     """Where a test's runs lie."""
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def disarmed() -> Iterator[None]:
+    """No task of this test fails after it."""
+    yield
+    Late.disarm()
 
 
 @pytest.fixture

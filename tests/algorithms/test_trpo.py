@@ -502,14 +502,13 @@ def test_killed_run_equals_undisturbed(tmp_path: Path) -> None:
     assert_same(only_run(tmp_path / "whole"), killed)
 
 
-def test_fault_of_an_env_is_named(runs: Path) -> None:
+def test_fault_of_an_env_is_named(runs: Path, disarmed: None) -> None:
     """Env 1 acts second in each turn, so its step 5 is the run's step 13 of three envs."""
     settings = {**RUN, "steps": 300, "renew_env": False}
     Late.arm("nan", victim=1, at=5)
     trainer = Trainer("trpo", "broken_envs:Late-v0", runs=runs, **settings)
     with pytest.raises(TrainingError, match=r"^env 1, step 13: .*observation"):
         run_to_end(trainer)
-    Late.disarm()
 
 
 def test_listed_without_a_multi_form(capsys: pytest.CaptureFixture[str]) -> None:

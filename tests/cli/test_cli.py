@@ -468,7 +468,7 @@ def test_time_ends_a_run(command: Command) -> None:
     directory = trained(command, "td3", *flags)
     first = directory.rows()[-1]
     assert (first["kind"], first["step"] > 0) == ("eval", True)
-    assert 1 <= first["wall_seconds"] < 10
+    assert 1 <= first["wall_seconds"] < 30  # a minute would be 60
     assert first["step"] < 1_000_000
     command("resume", directory.path, "--time", "2s", "-q")
     last = directory.rows()[-1]

