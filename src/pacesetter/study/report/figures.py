@@ -182,8 +182,8 @@ def figure_2(comparison: Comparison, window: int | None = None) -> Any:
         panel.legend(frameon=False, fontsize="small")
     _head(
         figure,
-        "The paper's figure 2: return against env steps of all members, mean over seeds and 95% t "
-        f"interval{_smoothed(window)}",
+        f"The paper's figure 2: return against env steps of all members, mean over seeds and {BAND}"
+        f"{_smoothed(window)}",
     )
     return figure
 
