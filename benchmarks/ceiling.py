@@ -25,7 +25,7 @@ import numpy as np
 from pacesetter import algorithms
 from pacesetter.batch import Layout, Spec
 from pacesetter.config import resolve
-from pacesetter.learner.compiled import CompiledLearner
+from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
 
 SPECS = {"HalfCheetah-v5": Spec(17, 6), "Ant-v5": Spec(105, 8), "Humanoid-v5": Spec(348, 17)}
 TARGETS = {("td3", 1, 1): 0.82, ("td3", 2, 1): 0.7, ("td3", 2, 2): 0.75}  # cores, members
@@ -109,7 +109,7 @@ def whole(
     run = map if members == 1 else workers.map
 
     def one(state: Any, member: int) -> Any:
-        return compiled.update(state, member, 0, rows, None, still).state
+        return compiled.update(state, member, UpdateInputs(0, rows, None, still)).state
 
     def call() -> Any:
         states[:] = run(one, states, range(members))

@@ -184,7 +184,7 @@ BOUNDS = {"Humanoid-v5": (-0.4, 0.4), "HalfCheetah-v5": (-1, 1), PROBE: ([-2, 0]
 def test_actions_are_in_the_envs_units(env: str, rng: np.random.Generator) -> None:
     """From bound to bound and never beyond, however large the observation."""
     random = make_policy(env, rng)
-    size, outputs = random.actors[0][0]["kernel"].shape[0], len(random.low)
+    size, outputs = random.observation_size, len(random.low)
     policy = replace(random, actors=[make_layers(rng, [size, outputs])])
     low, high = (np.broadcast_to(np.float32(bound), outputs) for bound in BOUNDS[env])
     actions = policy(rng.normal(size=(300, size)) * 10.0 ** rng.integers(-3, 6, size=(300, 1)))

@@ -49,7 +49,6 @@ class Layout:
 
     def __init__(self, spec: Spec, masks: int = 0) -> None:
         observation, action = spec
-        self.spec = spec
         self.shapes: dict[str, Shape] = {
             "observation": (observation,),
             "action": (action,),

@@ -14,7 +14,15 @@ from pydantic.dataclasses import dataclass
 from pacesetter import algorithms
 from pacesetter.ensemble import varied
 from pacesetter.errors import UsageError, unknown
-from pacesetter.settings import ROWS_A_TICK, STRICT, OffPolicy, OnPolicy, Settings, budget
+from pacesetter.settings import (
+    MAX_ROWS_PER_TICK,
+    STRICT,
+    ModelDriven,
+    OffPolicy,
+    OnPolicy,
+    Settings,
+    budget,
+)
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.task import Task
 from pacesetter.settings.validation import build, fields_of
@@ -110,10 +118,8 @@ def preset_layers(name: str, env: str) -> tuple[str, list[Settings]]:
         base, layers = preset_layers(name.removeprefix("multi-"), env)
         return base, [*layers, {"members": 2, "rule": "best"}]
     if name not in algorithms.names() and ":" not in name:
-        multi = [
-            f"multi-{base}" for base in algorithms.names() if not algorithms.single_member(base)
-        ]
-        raise unknown("algorithm", name, {*algorithms.names(), *known, *multi})
+        every = {*algorithms.names(), *known, *algorithms.multi_names()}
+        raise unknown("algorithm", name, every)
     return name, []
 
 
@@ -154,21 +160,7 @@ def resolve(name: str, env: str, *layers: Mapping[str, Any]) -> Config:
             hyper = replace(hyper, lr_horizon=run.steps)
     if isinstance(hyper, OnPolicy):
         _refuse_ensemble(run)
-        if run.randomize and getattr(hyper, "known", False):
-            raise UsageError(
-                "randomize: --known takes the reward of one task, not of many; give --no-known"
-            )
-        if run.wrap and getattr(hyper, "known", False):
-            raise UsageError(
-                "wrap: --known takes the reward of the plain task, not of a wrapped one; "
-                "give --no-known"
-            )
-        rollout = hyper.parallel_envs * hyper.rollout_length
-        if run.steps < rollout:
-            raise UsageError(
-                f"steps: {run.steps} is less than one rollout of {rollout} steps; give at least "
-                "that, or a smaller --rollout-length or --parallel-envs"
-            )
+        _refuse_on_policy_conflicts(run, hyper)
     return Config(run, hyper)
 
 
@@ -181,11 +173,30 @@ def full_id(env: str) -> str:
     return ids.full_id(env)
 
 
+def _refuse_on_policy_conflicts(run: Run, hyper: OnPolicy) -> None:
+    known = isinstance(hyper, ModelDriven) and hyper.known
+    if run.randomize and known:
+        raise UsageError(
+            "randomize: --known takes the reward of one task, not of many; give --no-known"
+        )
+    if run.wrap and known:
+        raise UsageError(
+            "wrap: --known takes the reward of the plain task, not of a wrapped one; "
+            "give --no-known"
+        )
+    rollout = hyper.parallel_envs * hyper.rollout_length
+    if run.steps < rollout:
+        raise UsageError(
+            f"steps: {run.steps} is less than one rollout of {rollout} steps; give at least "
+            "that, or a smaller --rollout-length or --parallel-envs"
+        )
+
+
 def _refuse_conflicts(run: Run, hyper: OffPolicy) -> None:
-    if hyper.n_step * run.members * hyper.num_envs > ROWS_A_TICK:
+    if hyper.n_step * run.members * hyper.num_envs > MAX_ROWS_PER_TICK:
         raise UsageError(
             f"n_step: {hyper.n_step} with {run.members} members of {hyper.num_envs} envs; "
-            f"their product must be at most {ROWS_A_TICK}"
+            f"their product must be at most {MAX_ROWS_PER_TICK}"
         )
     if hyper.assess and hyper.num_envs > 1:
         raise UsageError(

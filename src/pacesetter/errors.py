@@ -42,13 +42,27 @@ class TaskError(TrainingError):
     """A fault of the task: it raised, exited, or gave what it must not."""
 
 
+def tell(line: str) -> None:
+    """A line for people, on stderr."""
+    print(f"pacesetter: {line}", file=sys.stderr, flush=True)
+
+
 @contextmanager
 def told(what: str, *kinds: type[Exception]) -> Generator[None]:
     """Tell errors of these kinds in a line on stderr instead of raising them."""
     try:
         yield
     except kinds as error:
-        print(f"pacesetter: {what}: {reason(error)}", file=sys.stderr)
+        tell(f"{what}: {reason(error)}")
+
+
+@contextmanager
+def writing(what: str, path: object) -> Generator[None]:
+    """Refuse in one line what cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{what}: cannot write {path}: {error.strerror or error}") from None
 
 
 def reason(error: BaseException) -> str:

@@ -136,7 +136,7 @@ def recipe_of(
 
 def _refuse_unfit(policy: Policy, world: Environment) -> None:
     """Refuse a policy of other sizes or action bounds than the env's."""
-    taken, given = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+    taken, given = policy.observation_size, len(policy.low)
     if (taken, given) != (world.observation_size, world.action_size):
         raise UsageError(
             f"env: {world.name} has observations of {world.observation_size} and actions of "

@@ -16,6 +16,7 @@ from pacesetter.types import Floats, Layers, Shape
 
 KIND = "policy"
 SUFFIX = ".safetensors"
+FILE = f"policy{SUFFIX}"  # in a run's folder, and on the hub
 CHAMPION = "champion:"
 SCHEMA = 1
 LAYERS = (
@@ -64,10 +65,14 @@ class Policy:
     shapes: tuple[Shape, Shape] | None = None  # the env's own, of observations and actions
 
     @property
+    def observation_size(self) -> int:
+        """Numbers of a flat observation."""
+        return self.actors[0][0]["kernel"].shape[0]
+
+    @property
     def sizes(self) -> list[int]:
         """Of an actor: the observation, each hidden layer, the action."""
-        layers = self.actors[0]
-        return [layers[0]["kernel"].shape[0], *(layer["kernel"].shape[1] for layer in layers)]
+        return [self.observation_size, *(layer["kernel"].shape[1] for layer in self.actors[0])]
 
     def __repr__(self) -> str:
         about = [str(self.about[key]) for key in ("env", "algorithm") if key in self.about]
@@ -78,7 +83,7 @@ class Policy:
     def __call__(self, observation: Any) -> Floats:
         """Action in the env's units and shape, clipped to its bounds."""
         x = np.asarray(observation, np.float32)
-        taken, given = self.shapes or ((self.actors[0][0]["kernel"].shape[0],), self.low.shape)
+        taken, given = self.shapes or ((self.observation_size,), self.low.shape)
         batch = x.shape[: x.ndim - len(taken)]
         if x.shape != (*batch, *taken):
             wanted = ", ".join(["...", *map(str, taken)])
@@ -89,7 +94,7 @@ class Policy:
     def act(self, observation: Any) -> Floats:
         """Action (..., A) in [-1, 1] for flat observations (..., O), the mean over the actors."""
         x = np.asarray(observation, np.float32)
-        size = self.actors[0][0]["kernel"].shape[0]
+        size = self.observation_size
         if x.shape[-1:] != (size,):
             raise UsageError(f"observation: shape {x.shape} given; this policy takes (..., {size})")
         if self.normalizer is not None:
@@ -149,7 +154,7 @@ def load(path: str | Path) -> Policy:
     path = file_of(path) or Path(path)
     # A person, or the hub's cache, may name a link; of a run's folder the file is its own.
     path = path.resolve() if path.is_symlink() else path
-    path = path / "policy.safetensors" if path.is_dir() else path
+    path = path / FILE if path.is_dir() else path
     arrays, table = storage.read(path, KIND)
     if table.get("schema") != SCHEMA:
         raise UsageError(
@@ -190,7 +195,7 @@ def _check(policy: Policy, arrays: storage.Arrays) -> None:
     for name, array in arrays.items():
         if array.dtype != np.float32 or array.size == 0 or not np.isfinite(array).all():
             raise ValueError(f"{name} must hold finite float32 numbers")
-    inputs = policy.actors[0][0]["kernel"].shape[0]
+    inputs = policy.observation_size
     for layers in policy.actors:
         outputs = _check_layers(layers, inputs)
         if policy.low.shape != (outputs,) or policy.high.shape != (outputs,):

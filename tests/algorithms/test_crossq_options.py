@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numeric import KEY, close, member, random_batch, random_state, slopes, squashed
+from numeric import KEY, close, member, random_batch, random_state, same, slopes, squashed
 from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms import crossq
@@ -177,13 +177,11 @@ def test_batch_norm_cancels_the_length(
     monkeypatch.setattr(batch_renorm, "EPSILON", 1e-15)
     network, x = random_state(learner(), rng, "actor").actor, rng.normal(size=(64, 3))
     with jax.enable_x64(True):
-        unit = batch_renorm.unit_length(network, head=False)
+        unit = batch_renorm.unit_length(network)
         assert not np.allclose(unit[0]["kernel"], network[0]["kernel"], rtol=0.1)
         said = [batch_renorm.train(net, x, False)[0] for net in (network, unit)]
-        headed = batch_renorm.unit_length(network, head=True)
     np.testing.assert_allclose(*said, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(length(headed[-1], with_bias=False), 1)
-    np.testing.assert_array_equal(headed[-1]["bias"], network[-1]["bias"])
+    assert same(unit[-1], network[-1])
 
 
 # Runs and presets.

@@ -21,6 +21,7 @@ from pacesetter.cli.main import main
 from pacesetter.config import resolve
 from pacesetter.dynamics.model import Dynamics, Known, Models
 from pacesetter.errors import UsageError
+from pacesetter.learner.compiled import UpdateInputs
 from pacesetter.networks import trust_region
 from pacesetter.replay import buffer
 from pacesetter.training.trainer import Trainer
@@ -97,13 +98,13 @@ def test_returns_of_a_perfect_linear_model(cart: me_trpo.METRPO) -> None:
     models, starts = linear(cart, 0, 0, 0), jnp.array([[0.0], [0.52]])
     whole = sum(0.05 * t for t in range(1, 21))
     cut = sum(0.52 + 0.05 * t for t in range(1, 11))
-    found = jax.jit(cart.returns)(models, steady(0.5), starts)
+    found = jax.jit(cart.imagined.returns)(models, steady(0.5), starts)
     np.testing.assert_allclose(found, [(whole + cut) / 2] * 3, rtol=1e-4)
 
 
 def test_returns_are_those_of_each_model_alone(cart: me_trpo.METRPO) -> None:
     models, starts = linear(cart, 0, -0.05, 0.01), jnp.zeros((1, 1))
-    found = jax.jit(cart.returns)(models, steady(0.5), starts)
+    found = jax.jit(cart.imagined.returns)(models, steady(0.5), starts)
     np.testing.assert_allclose(found[0], 10.5, rtol=1e-4)
     np.testing.assert_allclose(found[1], 0, atol=1e-4)
     expected = np.cumsum(np.full(20, 0.06))
@@ -112,21 +113,21 @@ def test_returns_are_those_of_each_model_alone(cart: me_trpo.METRPO) -> None:
 
 def test_actions_are_cut_for_the_models(cart: me_trpo.METRPO) -> None:
     models, starts = linear(cart, 0, 0, 0), jnp.full((1, 1), -9.0)
-    found = jax.jit(cart.returns)(models, steady(50.0), starts)
+    found = jax.jit(cart.imagined.returns)(models, steady(50.0), starts)
     np.testing.assert_allclose(found, sum(-9 + 0.1 * t for t in range(1, 21)), rtol=1e-4)
 
 
 def test_imagined_states_stay_near_the_data(cart: me_trpo.METRPO) -> None:
     """Ten deviations, here 10: a model that runs away is held there."""
     models, starts = linear(cart, -3, -3, -3), jnp.zeros((1, 1))
-    found = jax.jit(cart.returns)(models, steady(0.0), starts)
+    found = jax.jit(cart.imagined.returns)(models, steady(0.0), starts)
     np.testing.assert_allclose(found, -3 - 6 - 9 - 17 * 10, rtol=1e-5)
 
 
 def test_imagined_rollout(cart: me_trpo.METRPO) -> None:
     """Each row follows from the one before by one model's step; an end leads to a new start."""
     models, starts = linear(cart, 0, 0, 0), jnp.array([[0.3], [0.7]])
-    rows = jax.jit(cart.imagine)(models, steady(0.5), starts, jax.random.key(1))
+    rows = jax.jit(cart.imagined.rollout)(models, steady(0.5), starts, jax.random.key(1))
     assert rows.observation.shape == (20, 10, 1)
     np.testing.assert_allclose(
         rows.next_observation, rows.observation + 0.1 * jnp.clip(rows.action, -1, 1), atol=1e-5
@@ -148,10 +149,10 @@ def test_imagined_rollout(cart: me_trpo.METRPO) -> None:
 def test_each_step_draws_its_model(cart: me_trpo.METRPO) -> None:
     """Drifts tell the models apart; over 20 steps of many rollouts each is drawn equally often."""
     models, starts = linear(cart, 0, -1e-2, -2e-2), jnp.zeros((1, 1))
-    imagine = jax.jit(cart.imagine)
+    rollout = jax.jit(cart.imagined.rollout)
     counts = np.zeros(3)
     for i in range(30):
-        rows = imagine(models, steady(0.0), starts, jax.random.key(i))
+        rows = rollout(models, steady(0.0), starts, jax.random.key(i))
         move = rows.next_observation - rows.observation - 0.1 * jnp.clip(rows.action, -1, 1)
         number = np.asarray(jnp.round(move[..., 0] / -1e-2)).astype(int)
         assert (number == number[:, :1]).all()  # one for all paths of a step
@@ -164,7 +165,7 @@ def test_each_step_draws_its_model(cart: me_trpo.METRPO) -> None:
 def test_horizon_counts_a_value_or_ends_the_task(bootstrap: bool) -> None:
     algorithm = learner(bootstrap=bootstrap)
     models, starts = linear(algorithm, 0, 0), jnp.full((1, 1), -9.0)
-    rows = jax.jit(algorithm.imagine)(models, steady(0.0), starts, jax.random.key(0))
+    rows = jax.jit(algorithm.imagined.rollout)(models, steady(0.0), starts, jax.random.key(0))
     np.testing.assert_allclose(rows.discount[:-1], 0.99, rtol=1e-6)
     np.testing.assert_allclose(rows.discount[-1], 0.99 * bootstrap, rtol=1e-6)
 
@@ -193,11 +194,12 @@ class Scripted(me_trpo.METRPO):
     def base(self) -> trpo.TRPO:
         return Counting(self.spec, self.hyper)
 
-    def imagine(self, models: Any, actor: Any, starts: Any, key: Any) -> Any:
-        return None
-
-    def returns(self, models: Any, actor: Any, starts: Any) -> Any:
-        return models[jnp.round(actor.log_std[0]).astype(int)]
+    @property
+    def imagined(self) -> Any:
+        return SimpleNamespace(
+            rollout=lambda models, actor, starts, key: None,
+            returns=lambda models, actor, starts: models[jnp.round(actor.log_std[0]).astype(int)],
+        )
 
 
 class Counting(trpo.TRPO):
@@ -322,9 +324,9 @@ def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     seen: list[Any] = []
     update = compiled.update
 
-    def spy(state: Any, member: int, tick: int, rows: Any, *rest: Any) -> Any:
-        seen.append((rows.copy(), rest[-1]))
-        return update(state, member, tick, rows, *rest)
+    def spy(state: Any, member: int, inputs: UpdateInputs) -> Any:
+        seen.append((inputs.rows.copy(), inputs.extra))
+        return update(state, member, inputs)
 
     monkeypatch.setattr(compiled, "update", spy)
     return seen
@@ -489,7 +491,9 @@ def test_imagined_steps_are_drawn_where_models_learn_noise(noise: bool) -> None:
     models = algorithm.dynamics.init(jax.random.key(0))
     states, actions = jnp.zeros((2, 3, 1)), jnp.zeros((2, 3, 1))
     one, other = (
-        np.asarray(algorithm.transition(models, states, actions, jax.random.key(number))[0])
+        np.asarray(
+            algorithm.imagined.transition(models, states, actions, jax.random.key(number))[0]
+        )
         for number in (1, 2)
     )
     assert np.array_equal(one, other) != noise

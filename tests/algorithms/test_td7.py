@@ -474,7 +474,7 @@ def test_two_members(runs: Path, nans_raise: None) -> None:
     assert rows[-1]["step"] == 600
     assert [row for row in rows if row["kind"] == "select"]
     policy = trainer.policy()
-    assert np.isfinite(policy(np.zeros(policy.actors[0][0]["kernel"].shape[0]))).all()
+    assert np.isfinite(policy(np.zeros(policy.observation_size))).all()
 
 
 LEARNS: dict[str, Any] = TINY | {

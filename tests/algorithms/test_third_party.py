@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import third_party
+from pydantic.dataclasses import dataclass as settings
 from short_runs import TINY, assert_same, run_to_end
 from stopping import stop_at
 
 from pacesetter import algorithms
 from pacesetter.cli.main import main
 from pacesetter.config import resolve
+from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.policy import load
 from pacesetter.training.trainer import Trainer
@@ -123,6 +125,27 @@ def test_commands_know_it_from_its_file_alone(tmp_path: Path) -> None:
     words = ["--algos", "bare:Plain", "--envs", "Pendulum-v1", "--steps=300", "--runs=more"]
     run("bench", *words, *flags, "-q")
     assert "300 of 300" in run("list", "runs", "--runs", "more")
+
+
+@settings(frozen=True)
+class OfNoKind:
+    """Settings that say neither where data come from nor how many envs there are."""
+
+    width: int = 8
+
+
+class WithoutKind:
+    Hyper = OfNoKind
+
+
+class WithoutClass:
+    Hyper = OfNoKind()
+
+
+@pytest.mark.parametrize("name", ["WithoutKind", "WithoutClass", "OfNoKind"])
+def test_settings_of_no_kind_are_refused(name: str) -> None:
+    with pytest.raises(UsageError, match=rf"^algorithm: cannot load '{__name__}:{name}': .*Hyper"):
+        algorithms.find(f"{__name__}:{name}")
 
 
 def test_ensemble_of_a_foreign_algorithm_has_its_own_name() -> None:

@@ -21,6 +21,7 @@ from pacesetter.batch import Batch, Spec
 from pacesetter.cli.main import main
 from pacesetter.config import resolve
 from pacesetter.errors import TrainingError, UsageError
+from pacesetter.learner.compiled import UpdateInputs
 from pacesetter.networks import trust_region
 from pacesetter.training.trainer import Trainer
 
@@ -115,10 +116,10 @@ def test_conjugate_gradients_solve_a_system_in_dim_steps(rng: np.random.Generato
     with jax.enable_x64(True):
         basis, _ = np.linalg.qr(rng.normal(size=(12, 12)))
         matrix, right = basis * np.geomspace(1, 100, 12) @ basis.T, rng.normal(size=12)
-        expected = np.linalg.solve(matrix, right)
+        expected, system = np.linalg.solve(matrix, right), jnp.array(matrix)
         errors = []
         for steps in (6, 12):
-            found, _ = trpo.cg(lambda x: jnp.array(matrix) @ x, right, tol=1e-12, maxiter=steps)
+            found, _ = trust_region.cg(lambda x: system @ x, right, tol=1e-12, maxiter=steps)
             errors.append(np.linalg.norm(found - expected) / np.linalg.norm(expected))
     assert errors[1] < 1e-6 < 1e-2 < errors[0]
 
@@ -372,10 +373,9 @@ def watch(trainer: Trainer, monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, 
     seen: list[tuple[Any, ...]] = []
     update = loop.learners.compiled.update
 
-    def spy(state: Any, member: int, tick: int, rows: Any, weight: Any, *rest: Any) -> Any:
-        statistics, *_ = rest
-        seen.append((loop.learners.policy_params[0], rows.copy(), statistics))
-        return update(state, member, tick, rows, weight, *rest)
+    def spy(state: Any, member: int, inputs: UpdateInputs) -> Any:
+        seen.append((loop.learners.policy_params[0], inputs.rows.copy(), inputs.statistics))
+        return update(state, member, inputs)
 
     monkeypatch.setattr(loop.learners.compiled, "update", spy)
     return seen
@@ -400,9 +400,9 @@ def test_every_update_has_a_number_of_its_own(runs: Path) -> None:
     compiled, numbers = trainer.loop.learners.compiled, list[int]()
     update = compiled.update
 
-    def watched(state: Any, member: int, number: int, *rest: Any) -> Any:
-        numbers.append(number)
-        return update(state, member, number, *rest)
+    def watched(state: Any, member: int, inputs: UpdateInputs) -> Any:
+        numbers.append(inputs.call)
+        return update(state, member, inputs)
 
     compiled.update = watched  # type: ignore[method-assign]
     run_to_end(trainer)

@@ -21,8 +21,8 @@ from pacesetter.cli.main import main
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media import hub
-from pacesetter.media.record import INSTALL
 from pacesetter.media.record import record as film
+from pacesetter.media.scene import INSTALL
 from pacesetter.policy import champions, load
 from pacesetter.training.trainer import Trainer
 

@@ -27,7 +27,7 @@ from pacesetter.ensemble.rules import RULES, Choice, choose
 from pacesetter.ensemble.selection import POOLED_SELECTIONS, Selection, measure
 from pacesetter.envs import Environment, Recipe, environment
 from pacesetter.errors import UsageError
-from pacesetter.learner.compiled import KEYS, CompiledLearner, KeyUse
+from pacesetter.learner.compiled import KEYS, CompiledLearner, KeyUse, UpdateInputs
 from pacesetter.policy import normalize
 from pacesetter.seeding import Stream, episode_seed
 from pacesetter.training.trainer import Report, Trainer
@@ -125,7 +125,7 @@ def test_copies_share_no_buffer_and_no_noise(runs: Path, rng: np.random.Generato
             rng_k = copy.deepcopy(explorer.act_stream)
             actions.append(explorer.learner.act(params, (), observation, rng_k)[0])
         rows = loop.replays[0].sample(rng, (2, 16)).rows
-        loop.learners.update([0], [(99, rows, None, statistics)])
+        loop.learners.update([0], [UpdateInputs(99, rows, None, statistics)])
         after = jax.device_get(loop.learners.states)
     assert not np.any(actions[0] == actions[1])
     assert same(states[0], states[1])
@@ -353,13 +353,15 @@ def test_a_rule_scales_learning_rates(runs: Path, monkeypatch: pytest.MonkeyPatc
     hyper = loop.config.hyper
     for k, scale in enumerate((0.5, 0.25)):
         before = jax.tree.map(jnp.copy, loop.learners.states[k])
-        (found,) = loop.learners.update([k], [(7, rows, None, still, None, scales[k])])
+        inputs = UpdateInputs(7, rows, None, still, scales=scales[k])
+        (found,) = loop.learners.update([k], [inputs])
         plain = learner(spec=loop.explorers[0].learner.spec)
         plain = replace(
             plain, hyper=replace(hyper, critic_learning_rate=hyper.critic_learning_rate * scale)
         )
         layout = loop.learners.compiled.layout
-        expected = CompiledLearner(plain, layout, 0, False).update(before, k, 7, rows, None, still)
+        apart = CompiledLearner(plain, layout, 0, False)
+        expected = apart.update(before, k, UpdateInputs(7, rows, None, still))
         for one, other in zip(
             jax.tree.leaves(found.state), jax.tree.leaves(expected.state), strict=True
         ):
@@ -577,9 +579,9 @@ def test_clones_do_not_stay_clones(runs: Path) -> None:
     trainer = start(runs, same_init=True, rule="none", target_noise=0.0, steps=20)
     update, batches = trainer.loop.learners.compiled.update, []
 
-    def watched(state: Any, member: int, tick: int, rows: Any, *rest: Any) -> Any:
-        batches.append(rows)
-        return update(state, member, tick, rows, *rest)
+    def watched(state: Any, member: int, inputs: UpdateInputs) -> Any:
+        batches.append(inputs.rows)
+        return update(state, member, inputs)
 
     trainer.loop.learners.compiled.update = watched
     with until(trainer, "eval"):
@@ -617,7 +619,8 @@ def test_clones_on_one_minibatch_part_by_their_keys(
     loop = trainer.loop
     rows = rng.normal(size=(2, 16, loop.learners.compiled.layout.width)).astype(np.float32)
     update, statistics = loop.learners.compiled.update, loop.experience.normalizer.statistics()
-    moved = [update(loop.learners.states[k], k, 0, rows, None, statistics).state for k in (0, 1)]
+    inputs = UpdateInputs(0, rows, None, statistics)
+    moved = [update(loop.learners.states[k], k, inputs).state for k in (0, 1)]
     moved = jax.device_get(moved)
     trainer.close()
     assert same(*moved) == (noise == 0)
@@ -656,7 +659,7 @@ def test_no_two_draws_of_a_run_share_a_key() -> None:
     cycles = [0, 1, 2, KEYS - 1, KEYS, KEYS + 1, 5 * KEYS + 3]
     for cycle in cycles:
         for k, state in enumerate(states):
-            states[k] = compiled.update(state, k, cycle, rows, None, STILL).state
+            states[k] = compiled.update(state, k, UpdateInputs(cycle, rows, None, STILL)).state
             folded = jax.random.fold_in(jax.random.key(0), KeyUse.UPDATE)
             folded = jax.random.fold_in(jax.random.fold_in(folded, cycle), k)
             assert np.array_equal(states[k].key, jax.random.key_data(folded))
@@ -670,7 +673,7 @@ def test_keys_stay_of_their_kind_whatever_the_default_is_later() -> None:
         compiled = CompiledLearner(KeyTeller(), layout, seed=0, normalize=False)
         state = compiled.init(1, same=False)[0]
     rows = np.zeros((1, 1, layout.width), np.float32)
-    key = compiled.update(state, 0, 0, rows, None, STILL).state.key
+    key = compiled.update(state, 0, UpdateInputs(0, rows, None, STILL)).state.key
     assert key.shape == state.key.shape == (4,)
 
 
@@ -681,7 +684,8 @@ def test_members_learn_from_observations_as_they_act_on_them(rng: np.random.Gene
     rows = rng.normal(size=(1, 3, layout.width), scale=20).astype(np.float32)
     statistics = np.array([3, -2, 0], np.float32), np.array([2, 0.5, 7], np.float32)
     (state,) = compiled.init(1, same=True)
-    seen = np.asarray(compiled.update(state, 0, 0, rows, None, statistics).td_error[0])
+    inputs = UpdateInputs(0, rows, None, statistics)
+    seen = np.asarray(compiled.update(state, 0, inputs).td_error[0])
     batch = layout.unpack(rows[0])
     raw = np.stack([batch.observation, batch.next_observation], axis=1)
     assert np.abs(seen).max() == 10
@@ -704,10 +708,10 @@ def test_members_learn_from_the_rows_of_their_scope(runs: Path) -> None:
         update, seen = trainer.loop.learners.compiled.update, set()
 
         def watched(
-            state: Any, k: int, tick: int, rows: Any, *rest: Any, to: Any = update, into: Any = seen
+            state: Any, k: int, inputs: UpdateInputs, to: Any = update, into: Any = seen
         ) -> Any:
-            into |= {(k, mark) for mark in rows[..., 0].ravel()}
-            return to(state, k, tick, rows, *rest)
+            into |= {(k, mark) for mark in inputs.rows[..., 0].ravel()}
+            return to(state, k, inputs)
 
         trainer.loop.learners.compiled.update = watched
         run_to_end(trainer)

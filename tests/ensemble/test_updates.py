@@ -43,9 +43,9 @@ def test_update_is_given_its_sample_and_how_far_the_run_is(runs: Path) -> None:
         samples.append((sample(*words), replay.head))
         return samples[-1][0]
 
-    def watched_update(state: Any, k: int, *words: Any) -> Any:
-        result = update(state, k, *words)
-        given[k].append((words, np.array(result.td_error)))
+    def watched_update(state: Any, k: int, inputs: Any) -> Any:
+        result = update(state, k, inputs)
+        given[k].append((inputs, np.array(result.td_error)))
         return result
 
     def watched_feedback(numbers: Any, td_error: Any) -> None:
@@ -64,8 +64,8 @@ def test_update_is_given_its_sample_and_how_far_the_run_is(runs: Path) -> None:
     deviations = set()
     for n in range(calls):
         for k in (0, 1):
-            (drawn, head), (words, error) = samples[2 * n + k], given[k][n]
-            number, rows, weight, (mean, spread), extra, factors = words
+            (drawn, head), (inputs, error) = samples[2 * n + k], given[k][n]
+            number, rows, weight, (mean, spread), extra, factors = inputs
             so_far = compiled.layout.unpack(stored[:head])
             assert number == n
             np.testing.assert_array_equal(rows, stored[drawn.numbers])

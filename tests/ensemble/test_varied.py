@@ -19,8 +19,9 @@ from pacesetter.config import Run, resolve
 from pacesetter.ensemble.rules import Choice
 from pacesetter.ensemble.varied import decided, inherited, shown, spread
 from pacesetter.errors import UsageError
-from pacesetter.learner.compiled import CompiledLearner
-from pacesetter.learner.scales import VARIABLE, scale_of, value_of
+from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
+from pacesetter.learner.scales import scale_of, value_of
+from pacesetter.settings.ensemble import VARIABLE
 from pacesetter.training.trainer import Trainer
 
 GAMMAS, RATES = (0.98, 0.99, 0.995), (1e-4, 3e-4, 1e-3)
@@ -140,7 +141,7 @@ def test_scaled_learner_is_the_learner_of_those_settings(
         rows = rows_of(layout, gamma, np.random.default_rng(seed))[: made.updates_per_call]
         state = jax.tree.map(jnp.array, before)
         compiled = CompiledLearner(made, layout, 0, normalize=False)
-        update = compiled.update(state, 0, 3, rows, None, STILL, None, factors)
+        update = compiled.update(state, 0, UpdateInputs(3, rows, None, STILL, scales=factors))
         found.append(jax.device_get((update.state, update.td_error)))
     for one, two in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_allclose(one, two, rtol=2e-4, atol=1e-6)

@@ -201,6 +201,17 @@ def test_snapshot_of_another_seed_is_noticed() -> None:
     assert not other.restore(env.snapshot())
 
 
+def test_an_episode_that_now_ends_at_its_last_action_is_noticed() -> None:
+    """As where somebody has made the task's limit shorter since the snapshot."""
+    actions = np.zeros((3, 6), np.float32)
+    env, shorter = world("HalfCheetah-v5"), world("HalfCheetah-v5", max_episode_steps=3)
+    env.reset()
+    for action in actions:
+        env.step(action)
+    assert env.restore(env.snapshot())
+    assert not shorter.restore(env.snapshot())
+
+
 def test_starts_differ() -> None:
     """By seed, stream, member and episode."""
     keys = [(s, t, i, e) for s in range(3) for t in Stream for i in range(3) for e in range(20)]

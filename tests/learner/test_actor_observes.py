@@ -17,7 +17,7 @@ from pacesetter.cli.main import main
 from pacesetter.config import resolve
 from pacesetter.ensemble.averages import Averages
 from pacesetter.errors import UsageError
-from pacesetter.learner.compiled import CompiledLearner, of_transitions
+from pacesetter.learner.compiled import CompiledLearner, UpdateInputs, of_transitions
 from pacesetter.media.onnx import build
 from pacesetter.media.sb3 import SB3Policy
 from pacesetter.networks import mlp
@@ -131,7 +131,7 @@ def test_it_learns_as_from_observations_without_it(
         (state,) = (compiled.blinded(each) for each in program.init(1, same=False))
         still = np.zeros(5, np.float32), np.ones(5, np.float32)
         for call in range(updates):
-            state = program.update(state, 0, call, rows[call], None, still).state
+            state = program.update(state, 0, UpdateInputs(call, rows[call], None, still)).state
         return state
 
     found = learned(compiled)

@@ -11,7 +11,7 @@ from short_runs import TINY
 from pacesetter import Trainer, algorithms
 from pacesetter.batch import Layout, Spec
 from pacesetter.config import resolve
-from pacesetter.learner.compiled import CompiledLearner
+from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
 
 SPEC = Spec(observation_size=3, action_size=2)
 SMALL: dict[str, Any] = {"hidden": (8,), "normalize_reward": True}
@@ -35,7 +35,7 @@ def critic_after(name: str, reward: float, deviation: float) -> list[Any]:
     (state,) = compiled.init(1, same=False)
     extra = {"return_deviation": np.float32(deviation)}
     statistics = np.zeros(3, np.float32), np.ones(3, np.float32)
-    update = compiled.update(state, 0, 0, rows, None, statistics, extra)
+    update = compiled.update(state, 0, UpdateInputs(0, rows, None, statistics, extra))
     assert np.isfinite(update.losses).all()
     return jax.tree.leaves(update.state.critic)
 

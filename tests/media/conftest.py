@@ -6,7 +6,8 @@ import pytest
 from policies import untrained
 
 from pacesetter.errors import UsageError
-from pacesetter.media.record import INSTALL, record
+from pacesetter.media.record import record
+from pacesetter.media.scene import INSTALL
 from pacesetter.policy import Policy
 
 

@@ -21,8 +21,8 @@ from pacesetter.errors import TaskError, UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media.caption import caption
 from pacesetter.media.curve import curve
-from pacesetter.media.record import INSTALL, duration, record
-from pacesetter.media.scene import draw, gl, scene
+from pacesetter.media.record import duration, record
+from pacesetter.media.scene import INSTALL, draw, gl, scene
 from pacesetter.policy import Policy
 from pacesetter.runs import RunDirectory
 

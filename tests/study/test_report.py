@@ -16,7 +16,7 @@ from policies import untrained
 
 from pacesetter.cli.main import main
 from pacesetter.errors import TaskError, UsageError
-from pacesetter.media.record import INSTALL
+from pacesetter.media.scene import INSTALL
 from pacesetter.runs import RunDirectory
 from pacesetter.study.compare import stats
 from pacesetter.study.compare.comparison import compare

@@ -366,8 +366,8 @@ def test_fault_in_a_loss(
     compiled = trainer.loop.learners.compiled
     update = compiled.update
 
-    def broken(state: Any, member: int, *rest: Any) -> Any:
-        result = update(state, member, *rest)
+    def broken(state: Any, member: int, inputs: Any) -> Any:
+        result = update(state, member, inputs)
         losses = np.array(result.losses)
         if trainer.progress.step == 600 and member == 1:
             losses[0] = np.inf

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import numpy as np
 import pytest
@@ -168,6 +169,39 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: P
         with pytest.raises(UsageError, match=words):
             Trainer(algorithm, env, runs=runs, name="new", start_from=str(source), **settings)
         assert not list(runs.glob("*/new"))
+
+
+class Watched(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A task that knows how many of its kind are open."""
+
+    open = 0
+
+    def __init__(self) -> None:
+        super().__init__(gymnasium.make("Pendulum-v1"))
+        Watched.open += 1
+
+    def close(self) -> None:
+        super().close()
+        Watched.open -= 1
+
+
+def test_a_trainer_that_cannot_start_closes_its_envs(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Watched, "open", 0)
+    with pytest.raises(UsageError, match="'nowhere' not found"):
+        Trainer("td3", Watched, runs=runs, start_from="nowhere", **SHORT)
+    with pytest.raises(UsageError, match="actor_observes"):
+        Trainer("td3", Watched, runs=runs, actor_observes="0:99", **SHORT)
+    assert Watched.open == 0
+    old = Trainer("td3", Watched, runs=runs, **SHORT)
+    with pytest.raises(UsageError, match="in use"):
+        Trainer.resume(old.directory.path, env=Watched)
+    old.close()
+    old.directory.state_file.write_bytes(b"")
+    with pytest.raises(UsageError, match="damaged"):
+        Trainer.resume(old.directory.path, env=Watched)
+    assert Watched.open == 0
 
 
 # Stop at a return.

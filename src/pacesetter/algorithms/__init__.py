@@ -5,6 +5,7 @@ from importlib.metadata import entry_points
 from typing import Any, NamedTuple
 
 from pacesetter.errors import UsageError, unknown
+from pacesetter.settings import OffPolicy, OnPolicy
 
 
 class Entry(NamedTuple):
@@ -45,6 +46,11 @@ def names() -> list[str]:
     return [*TABLE, *plugins()]
 
 
+def multi_names() -> dict[str, str]:
+    """`multi-NAME` and the algorithm of which it is several members."""
+    return {f"multi-{name}": name for name in names() if not single_member(name)}
+
+
 def single_member(name: str) -> bool:
     """Whether there is no `multi-` form of an algorithm."""
     return name in TABLE and TABLE[name].single_member
@@ -59,8 +65,9 @@ def find(name: str) -> type[Any]:
     path, _, attribute = target.partition(":")
     try:
         learner: Any = getattr(import_module(path), attribute)
-        if not isinstance(learner.Hyper, type):
-            raise TypeError("its attribute Hyper must be a settings class")
+        hyper: Any = learner.Hyper
+        if not (isinstance(hyper, type) and issubclass(hyper, OffPolicy | OnPolicy)):
+            raise TypeError("its attribute Hyper must derive from settings.OffPolicy or OnPolicy")
     except (Exception, SystemExit) as error:
         raise UsageError(f"algorithm: cannot load '{target}': {error}") from None
     return learner

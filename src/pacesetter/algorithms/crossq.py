@@ -28,18 +28,14 @@ from pacesetter.algorithms.stochastic import Exploration, StochasticLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import batch_renorm, critic_heads, gaussian, mlp
 from pacesetter.policy import Actors
-from pacesetter.settings import STRICT, OffPolicy
+from pacesetter.settings import STRICT, OffPolicy, check_loss
 from pacesetter.settings.values import LARGEST_COUNTED, Count, LearningRate, Warmup, Width
 
 
 def _check_bins(bins: int, info: ValidationInfo) -> int:
     if bins == 1:
         raise ValueError("one bin cannot tell returns apart; 0, or at least 2")
-    if bins and info.data.get("replay") == "lap":
-        raise ValueError(
-            "cannot be combined with --replay lap, as each sets the loss; allowed with it: 0"
-        )
-    return bins
+    return check_loss(bins, info)
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
@@ -197,8 +193,8 @@ class CrossQ(StochasticLearner):
             bonus = -(jnp.exp(state.log_alpha) * log_prob)
             target_q = self.head.target(later, batch.reward, batch.discount, bonus)
             target_q = jax.lax.stop_gradient(target_q)
-            losses, td_error = self.head.loss(now, target_q)
-            return (batch.weight * losses).mean(axis=1).sum(), (td_error.max(axis=0), trained)
+            value, td_error = self.head.weighted_loss(now, target_q, batch.weight)
+            return value, (td_error, trained)
 
         (value, (td_error, trained)), gradient = jax.value_and_grad(loss, has_aux=True)(
             state.critic
@@ -235,8 +231,7 @@ class CrossQ(StochasticLearner):
     def _unit_length(self, network: mlp.Network) -> mlp.Network:
         if not self.hyper.weight_norm:
             return network
-        # The head's length is the size of the values, which no normalisation behind it cancels.
-        return batch_renorm.unit_length(network, head=False)
+        return batch_renorm.unit_length(network)
 
     def _adam(self, rate: float) -> optax.GradientTransformation:
         return optax.adam(rate, b1=self.hyper.adam_momentum)

@@ -61,6 +61,4 @@ class DDPG(td3.TD3):
 
     @cached_property
     def critic_optimizer(self) -> optax.GradientTransformation:
-        adam = optax.adam(self.hyper.critic_learning_rate)
-        decay = self.hyper.critic_decay
-        return optax.chain(optax.add_decayed_weights(decay), adam) if decay else optax.chain(adam)
+        return mlp.adam(self.hyper.critic_learning_rate, self.hyper.critic_decay)

@@ -1,4 +1,4 @@
-"""What learners with a deterministic actor share: how they act, explore and copy one another."""
+"""What learners with a deterministic actor share: how they act, explore, smooth and copy."""
 
 from functools import cached_property
 from typing import Any
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pacesetter.algorithms.contract import Learner
+from pacesetter.algorithms.contract import Array, Learner
 from pacesetter.networks import exploration, mlp
 from pacesetter.policy import Actors
 from pacesetter.types import Floats, Layers
@@ -17,13 +17,20 @@ class DeterministicLearner(Learner):
     """Defaults for TD3 and its kin.
 
     Their states have `actor`, `target_actor` and `critic`, an optimiser state of each network that
-    learns, `updates`, and `exploration`: what the exploration adapts, () for most kinds.
+    learns, `updates`, and `exploration`: what the exploration adapts, () for most kinds. Their
+    settings have `exploration` and `exploration_noise`, and with `smoothed` those of target noise.
     """
 
     @cached_property
     def exploration(self) -> exploration.Exploration:
         """How it explores."""
         return exploration.KINDS[self.hyper.exploration]
+
+    def smoothed(self, action: Array, key: Array) -> Array:
+        """A target's actions (B, A) with clipped noise, drawn for each transition."""
+        limit = self.hyper.target_noise_clip
+        noise = self.hyper.target_noise * jax.random.normal(key, action.shape)
+        return jnp.clip(action + jnp.clip(noise, -limit, limit), -1, 1)
 
     def policy_params(self, state: Any) -> tuple[mlp.Network, Any]:
         return state.actor, state.exploration
@@ -38,7 +45,8 @@ class DeterministicLearner(Learner):
         return self.exploration.act(params, noise_state, observation, scale, rng)
 
     def policy(self, state: Any) -> Actors:
-        one = jax.tree.map(lambda x: x[None], state.actor)
+        actor, _ = self.policy_params(state)
+        one = jax.tree.map(lambda x: x[None], actor)
         return Actors(one, activation="relu", output="tanh")
 
     def with_actor(self, state: Any, layers: Layers) -> Any:

@@ -23,9 +23,10 @@ from pacesetter.algorithms import trpo
 from pacesetter.algorithms.contract import Array, Learner, Update
 from pacesetter.batch import Batch, Spec
 from pacesetter.dynamics.fit import fit
+from pacesetter.dynamics.imagined import Imagined
 from pacesetter.dynamics.model import DETERMINISTIC, GAUSSIAN, Dynamics, Known, Models
-from pacesetter.networks.trust_region import Gaussian, distribution_of
-from pacesetter.policy import OBSERVATION_LIMIT, Actors
+from pacesetter.networks.trust_region import Gaussian
+from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, ModelDriven, only
 from pacesetter.settings.values import LARGEST_COUNTED, Count, SmallCount, SmallCountOr0, Width
 from pacesetter.types import Floats
@@ -150,6 +151,13 @@ class METRPO(Learner):
             learning_rate=hyper.model_learning_rate,
         )
 
+    @cached_property
+    def imagined(self) -> Imagined:
+        """The policy's episodes in the models."""
+        hyper = self.hyper
+        envs = max(hyper.imagined_steps // hyper.horizon, 1)
+        return Imagined(self.dynamics, hyper.gamma, hyper.horizon, envs, hyper.bootstrap)
+
     def init(self, key: Array) -> State:
         learner_key, models_key = jax.random.split(key)
         models = self.dynamics.init(models_key)
@@ -182,7 +190,7 @@ class METRPO(Learner):
         return {
             "resets": updates * hyper.starts,
             "policy_updates": searched,
-            "imagined_steps": searched * self.imagined_envs * hyper.horizon,
+            "imagined_steps": searched * self.imagined.envs * hyper.horizon,
             "model_epochs": int(state.fitted),
         }
 
@@ -190,11 +198,6 @@ class METRPO(Learner):
         return state._replace(
             searched=jnp.zeros_like(state.searched), fitted=jnp.zeros_like(state.fitted)
         )
-
-    @property
-    def imagined_envs(self) -> int:
-        """Episodes that are imagined at a time."""
-        return max(self.hyper.imagined_steps // self.hyper.horizon, 1)
 
     def policy(self, state: State) -> Actors:
         return self.base.policy(state.learner)
@@ -232,7 +235,7 @@ class METRPO(Learner):
 
         def update(i: Array, learner: trpo.State) -> trpo.State:
             imagine_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-            batch = self.imagine(models, learner.actor, starts, imagine_key)
+            batch = self.imagined.rollout(models, learner.actor, starts, imagine_key)
             return self.base.update(learner, batch, update_key).state
 
         def go_on(search: Search) -> Array:
@@ -241,7 +244,7 @@ class METRPO(Learner):
         def improve(search: Search) -> Search:
             made = jnp.minimum(search.made + hyper.check_every, hyper.policy_updates)
             learner = jax.lax.fori_loop(search.made, made, update, search.learner)
-            returns = self.returns(models, learner.actor, starts)
+            returns = self.imagined.returns(models, learner.actor, starts)
             keep = agree(returns, search.returns, hyper.share)
             kept, returns = jax.tree.map(
                 lambda new, old: jnp.where(keep, new, old),
@@ -252,78 +255,9 @@ class METRPO(Learner):
             return Search(learner, kept, returns, stale, made)
 
         none = jnp.zeros((), jnp.int32)
-        returns = self.returns(models, learner.actor, starts)
+        returns = self.imagined.returns(models, learner.actor, starts)
         begin = Search(learner, learner.actor, returns, none, none)
         return jax.lax.while_loop(go_on, improve, begin)
-
-    def imagine(self, models: Models, actor: Gaussian, starts: Array, key: Array) -> Batch:
-        """Imagined episodes as a rollout (horizon, E, ...), one model drawn for each step.
-
-        Where an episode ends before the horizon, another begins; it is cut with the rest.
-        """
-        hyper, dynamics, envs = self.hyper, self.dynamics, self.imagined_envs
-
-        def some_starts(key: Array) -> Array:
-            return starts[jax.random.randint(key, (envs,), 0, len(starts))]
-
-        def step(observation: Array, key: Array) -> tuple[Array, Batch]:
-            act_key, choice_key, model_key, start_key = jax.random.split(key, 4)
-            mean, log_std = distribution_of(actor, observation)
-            action = mean + jnp.exp(log_std) * jax.random.normal(act_key, mean.shape)
-            one = dynamics.choose(models, jax.random.randint(choice_key, (), 0, dynamics.members))
-            parts = self.transition(one, observation[None], action[None], model_key)
-            next_observation, reward, terminated = (part[0] for part in parts)
-            row = Batch(
-                observation=observation,
-                action=action,
-                reward=reward,
-                next_observation=next_observation,
-                discount=hyper.gamma * (1.0 - terminated),
-                last=1.0 * terminated,
-                weight=jnp.ones(envs),
-                mask=jnp.zeros((envs, 0)),
-            )
-            return jnp.where(terminated[:, None], some_starts(start_key), next_observation), row
-
-        start_key, steps_key = jax.random.split(key)
-        keys = jax.random.split(steps_key, hyper.horizon)
-        _, batch = jax.lax.scan(step, some_starts(start_key), keys)
-        if hyper.bootstrap:
-            return batch
-        return batch._replace(discount=batch.discount.at[-1].set(0))
-
-    def returns(self, models: Models, actor: Gaussian, starts: Array) -> Array:
-        """Mean return (K,) of the mean action in each model alone, from all starts (M, O)."""
-
-        def step(carry: tuple[Array, Array], key: Array) -> tuple[Any, Array]:
-            observation, running = carry
-            action, _ = distribution_of(actor, observation)
-            next_observation, reward, terminated = self.transition(models, observation, action, key)
-            return (next_observation, running & ~terminated), running * reward
-
-        observation = jnp.stack([starts] * self.dynamics.members)
-        running = jnp.ones(observation.shape[:-1], bool)
-        # The same noise for every policy, where the models have any.
-        keys = jax.random.split(jax.random.key(0), self.hyper.horizon)
-        _, rewards = jax.lax.scan(step, (observation, running), keys)
-        return rewards.sum(axis=0).mean(axis=-1)
-
-    def transition(
-        self, models: Models, observation: Array, action: Array, key: Array
-    ) -> tuple[Array, Array, Array]:
-        """Next observation, reward and end of each member's own states (K, B, ...).
-
-        Imagined states stay within ten deviations of the real ones.
-        """
-        dynamics, scale = self.dynamics, models.scale
-        action = jnp.clip(action, -1, 1)
-        size = self.spec.observation_size
-        mean, reach = scale.mean[:size], OBSERVATION_LIMIT * scale.deviation[:size]
-        next_observation = dynamics.sample(models, observation, action, key)
-        next_observation = jnp.clip(next_observation, mean - reach, mean + reach)
-        reward = dynamics.reward(models, observation, action, next_observation).mean(axis=0)
-        ends = dynamics.terminated(models, observation, action, next_observation)
-        return next_observation, reward, ends > 0.5
 
 
 def agree(returns: Array, before: Array, share: float) -> Array:

@@ -142,8 +142,7 @@ class SAC(StochasticLearner):
 
         def loss(critic: mlp.Network) -> tuple[Array, Array]:
             outputs = mlp.each(mlp.outputs, critic, batch.observation, batch.action)
-            losses, td_error = self.head.loss(outputs, target_q)
-            return (weight * losses).mean(axis=1).sum(), td_error.max(axis=0)
+            return self.head.weighted_loss(outputs, target_q, weight)
 
         (value, td_error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         adam = optax.adam(self.hyper.critic_learning_rate)

@@ -44,7 +44,7 @@ OFFICIAL_BLOCK = 1000  # env steps between blocks of updates in the authors' cod
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Ensemble:
+class EnsembleHyper:
     """What the ensemble adds; without a base class, whose defaults would hide the learner's own.
 
     Defaults are the reference's, with `ucb` from the range that the paper searched.
@@ -81,7 +81,7 @@ class Ensemble:
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Hyper(Ensemble, sac.Hyper):
+class Hyper(EnsembleHyper, sac.Hyper):
     """SAC's settings and the ensemble's."""
 
 

@@ -18,7 +18,7 @@ from pacesetter.settings import STRICT
 
 
 @settings(frozen=True, kw_only=True, config=STRICT)
-class Hyper(sunrise.Ensemble, td3.Hyper):
+class Hyper(sunrise.EnsembleHyper, td3.Hyper):
     """TD3's settings and the ensemble's."""
 
     exploration: Literal["gaussian"] = Field("gaussian", description="noise on proposed actions")
@@ -40,8 +40,9 @@ class SunriseTD3(sunrise.Sunrise):
     def fit_actor(
         self, state: td3.State, batch: Batch, key: Array, weight: Array
     ) -> tuple[td3.State, dict[str, Array]]:
+        """One learner's actor update, and that of its targets."""
         state, loss = self.base.fit_actor(state, batch, weight)
-        return state, {"actor_loss": loss}
+        return self.base.update_targets(state), {"actor_loss": loss}
 
     def _of_base(self, params: sunrise.Params) -> Any:
         return params.actor, ()

@@ -101,6 +101,7 @@ class TD3(DeterministicLearner):
         state, (losses, td_error) = each_minibatch(self.critic_step, state, batch, keys[:-1])
         last = last_minibatch(batch)
         state, actor_loss = self.fit_actor(state, last)
+        state = self.update_targets(state)
         losses = {name: loss.mean() for name, loss in losses.items()} | {"actor_loss": actor_loss}
         if self.exploration.adapts:
             state, losses["sigma"] = adapt(self, state, last.observation, keys[-1])
@@ -120,10 +121,7 @@ class TD3(DeterministicLearner):
 
     def next_action(self, state: State, observation: Array, key: Array) -> Array:
         """The target actor's action (B, A) with clipped noise, drawn for each transition."""
-        limit = self.hyper.target_noise_clip
-        action = mlp.actor(state.target_actor, observation)
-        noise = self.hyper.target_noise * jax.random.normal(key, action.shape)
-        return jnp.clip(action + jnp.clip(noise, -limit, limit), -1, 1)
+        return self.smoothed(mlp.actor(state.target_actor, observation), key)
 
     def fit_critic(
         self, state: State, batch: Batch, target_q: Array, weight: Array
@@ -132,8 +130,7 @@ class TD3(DeterministicLearner):
 
         def loss(critic: mlp.Network) -> tuple[Array, Array]:
             outputs = self.outputs(critic, batch.observation, batch.action)
-            losses, td_error = self.head.loss(outputs, target_q)
-            return (weight * losses).mean(axis=1).sum(), td_error.max(axis=0)
+            return self.head.weighted_loss(outputs, target_q, weight)
 
         (value, td_error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         critic, opt_state = mlp.apply_gradient(
@@ -145,7 +142,7 @@ class TD3(DeterministicLearner):
     def fit_actor(
         self, state: State, batch: Batch, weight: Array | float = 1.0
     ) -> tuple[State, Array]:
-        """One Adam step of the actor up its objective, then one soft update of all targets."""
+        """One Adam step of the actor up its objective."""
 
         def loss(actor: mlp.Network) -> Array:
             action = mlp.actor(actor, batch.observation)
@@ -155,14 +152,15 @@ class TD3(DeterministicLearner):
         actor, opt_state = mlp.apply_gradient(
             self.actor_optimizer, state.actor, gradient, state.actor_opt_state
         )
+        return state._replace(actor=actor, actor_opt_state=opt_state), value
+
+    def update_targets(self, state: State) -> State:
+        """One soft update of all targets."""
         soft_update = partial(optax.incremental_update, step_size=self.hyper.tau)
-        state = state._replace(
-            actor=actor,
-            actor_opt_state=opt_state,
-            target_actor=soft_update(actor, state.target_actor),
+        return state._replace(
+            target_actor=soft_update(state.actor, state.target_actor),
             target_critic=soft_update(state.critic, state.target_critic),
         )
-        return state, value
 
     def actor_value(self, critic: mlp.Network, observation: Array, action: Array) -> Array:
         """The value (B,) that the actor climbs: in TD3 the first critic's."""

@@ -28,7 +28,6 @@ from pacesetter.algorithms.deterministic import DeterministicLearner
 from pacesetter.batch import Batch, Spec
 from pacesetter.errors import UsageError
 from pacesetter.networks import critic_heads, mlp, sale
-from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OffPolicy
 from pacesetter.settings.values import LearningRate, SmallCount, Width
 
@@ -153,7 +152,7 @@ class TD7(DeterministicLearner):
         state, (losses, td_error) = each_minibatch(self.critic_step, state, batch, keys)
         state, actor_loss = self.fit_actor(state, last_minibatch(batch))
         losses = {name: loss.mean() for name, loss in losses.items()}
-        return Update(self.copied(state), losses | {"actor_loss": actor_loss}, td_error)
+        return Update(self.update_targets(state), losses | {"actor_loss": actor_loss}, td_error)
 
     def critic_step(self, state: State, batch: Batch, key: Array) -> tuple[State, Any]:
         """Move the encoder, then every critic towards the target of one minibatch."""
@@ -182,11 +181,8 @@ class TD7(DeterministicLearner):
     def target(self, state: State, batch: Batch, key: Array) -> Array:
         """Clipped double-Q target (B,), of a next value within the range of earlier targets."""
         encoder, observation = state.target_encoder, batch.next_observation
-        limit = self.hyper.target_noise_clip
         zs = sale.zs(encoder, observation)
-        action = sale.action(state.target_actor, observation, zs)
-        noise = self.hyper.target_noise * jax.random.normal(key, action.shape)
-        action = jnp.clip(action + jnp.clip(noise, -limit, limit), -1, 1)
+        action = self.smoothed(sale.action(state.target_actor, observation, zs), key)
         next_q = critic_heads.min_q(
             self.values(state.target_critic, encoder, observation, zs, action)
         )
@@ -199,8 +195,7 @@ class TD7(DeterministicLearner):
 
         def loss(critic: mlp.Network) -> tuple[Array, Array]:
             outputs = mlp.each(sale.outputs, critic, batch.observation, batch.action, zsa, zs)
-            losses, td_error = self.head.loss(outputs, target_q)
-            return (batch.weight * losses).mean(axis=1).sum(), td_error.max(axis=0)
+            return self.head.weighted_loss(outputs, target_q, batch.weight)
 
         (value, td_error), gradient = jax.value_and_grad(loss, has_aux=True)(state.critic)
         adam = optax.adam(self.hyper.critic_learning_rate)
@@ -222,7 +217,7 @@ class TD7(DeterministicLearner):
         actor, opt_state = mlp.apply_gradient(adam, state.actor, gradient, state.actor_opt_state)
         return state._replace(actor=actor, actor_opt_state=opt_state), value
 
-    def copied(self, state: State) -> State:
+    def update_targets(self, state: State) -> State:
         """The state with its targets renewed, if `copy_every` critic updates have passed.
 
         The reference does so at that very update; here the cycle of `policy_delay` is finished.
@@ -249,11 +244,6 @@ class TD7(DeterministicLearner):
 
     def policy_params(self, state: State) -> tuple[mlp.Network, Any]:
         return sale.with_encoder(state.actor, state.fixed_encoder), state.exploration
-
-    def policy(self, state: State) -> Actors:
-        actor, _ = self.policy_params(state)
-        one = jax.tree.map(lambda x: x[None], actor)
-        return Actors(one, activation="relu", output="tanh")
 
     with_actor = Learner.with_actor  # an actor reads the encoder that its critics read too
 

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
-from jax.scipy.sparse.linalg import cg
 from pydantic import Field
 from pydantic.dataclasses import dataclass as settings
 
@@ -32,6 +31,7 @@ from pacesetter.networks.trust_region import (
     kl,
     line_search,
     log_probability,
+    natural_step,
 )
 from pacesetter.policy import Actors
 from pacesetter.settings import STRICT, OnPolicy
@@ -161,14 +161,7 @@ class TRPO(Learner):
 
         before, gradient = jax.value_and_grad(surrogate)(parameters)
         fisher = fisher_product(distribution, parameters)
-
-        def damped(vector: Array) -> Array:
-            return fisher(vector) + hyper.damping * vector
-
-        direction, _ = cg(damped, gradient, tol=1e-6, maxiter=hyper.gradient_steps)
-        # Without a gradient there is no direction, and no 0 / 0 either.
-        curvature = jnp.maximum(direction @ damped(direction), jnp.finfo(jnp.float32).tiny)
-        full = jnp.sqrt(2 * hyper.max_kl / curvature) * direction
+        full = natural_step(fisher, gradient, hyper.damping, hyper.max_kl, hyper.gradient_steps)
 
         def judge(candidate: Array) -> tuple[Array, Array]:
             divergence = kl(old, distribution(candidate))

@@ -2,13 +2,12 @@
 
 import argparse
 import shlex
-import sys
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, look_here, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
 from pacesetter.config import Run, preset_layers
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, tell
 from pacesetter.process import cores, exit_code, stopping
 from pacesetter.settings import Settings
 from pacesetter.study.bench import suite as suites
@@ -117,11 +116,11 @@ def _print(suite: Suite, jobs: list[suites.Job], form: str) -> int:
     work = Bench(jobs)
     left = work.left
     for name, why in work.failed.items():
-        print(f"pacesetter: {name}: {why}", file=sys.stderr)
+        tell(f"{name}: {why}")
     if left:
         print(slurm(suite.name, left) if form == "slurm" else "\n".join(commands(left)))
     elif not work.failed:
-        print("pacesetter: every run has finished", file=sys.stderr)
+        tell("every run has finished")
     return 1 if work.failed else 0
 
 
@@ -145,7 +144,7 @@ def _work(jobs: list[suites.Job], own: dict[str, Any], words: list[str]) -> int:
         for _ in work.run(executor):
             show(work)
     for name, why in work.failed.items():
-        print(f"pacesetter: {name}: {why}", file=sys.stderr)
+        tell(f"{name}: {why}")
     print(
         f"{len(work.finished)} of {len(jobs)} runs finished, {work.before} of them before; "
         f"{len(work.failed)} failed"
@@ -163,7 +162,7 @@ def _warn(jobs: list[suites.Job]) -> None:
     lines = {(job.config.run.env, job.config.run.name): within_warmup(job.config) for job in jobs}
     for (env, name), line in lines.items():
         if line:
-            print(f"pacesetter: {env} {name}: {line}", file=sys.stderr)
+            tell(f"{env} {name}: {line}")
 
 
 def _executor(own: dict[str, Any]) -> Any:

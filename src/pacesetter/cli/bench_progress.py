@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from pacesetter.cli.progress import Pace, bars
+from pacesetter.errors import tell
 from pacesetter.files import regular
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.storage import FAULTS
@@ -44,7 +45,7 @@ def _waits() -> Show:
     def show(bench: Bench) -> None:
         for name in bench.aside.keys() - told:
             told.add(name)
-            print(f"pacesetter: {name}: in use by {bench.aside[name]}", file=sys.stderr, flush=True)
+            tell(f"{name}: in use by {bench.aside[name]}")
 
     return show
 

@@ -1,8 +1,7 @@
 """The verb `compare`."""
 
-import sys
-
 from pacesetter.cli.flags import Parser, parser
+from pacesetter.errors import tell
 
 
 def compare(words: list[str]) -> int:
@@ -23,7 +22,7 @@ def compare(words: list[str]) -> int:
         mixed=found.mixed,
     )
     for why in comparison.damaged:
-        print(f"pacesetter: left out: {why}", file=sys.stderr)
+        tell(f"left out: {why}")
     for path in paths:
         output.write(comparison, path, options)
         print(path)

@@ -32,7 +32,7 @@ RUN = {"bash": "_pacesetter_runs", "zsh": "_pacesetter_runs", "tcsh": "f"}
 
 def completion(words: list[str]) -> int:
     """Print the script by which Tab completes in bash, zsh or tcsh."""
-    from pacesetter.media.extras import need
+    from pacesetter.extras import need
 
     command = parser("completion", "Print a script for a shell, so that Tab completes pacesetter.")
     command.add_argument("shell", metavar="|".join(SHELLS), help="shell that reads the script")
@@ -124,9 +124,7 @@ def _algorithms() -> list[str]:
     from pacesetter import algorithms
     from pacesetter.config import presets
 
-    names = algorithms.names()
-    several = [f"multi-{name}" for name in names if not algorithms.single_member(name)]
-    return [*names, *several, *presets()]
+    return [*algorithms.names(), *algorithms.multi_names(), *presets()]
 
 
 def _add_all_settings(found: Parser) -> None:

@@ -192,7 +192,7 @@ def _allowed(info: Any) -> list[str]:
     annotation = info.annotation
     if get_origin(annotation) is Literal:
         *others, last = map(str, get_args(annotation))
-        return [f"{', '.join(others)} or {last}"]
+        return [f"{', '.join(others)} or {last}" if others else last]
     return [
         f"{word} {getattr(mark, name)}"
         for mark in info.metadata

@@ -42,11 +42,11 @@ def list_(words: list[str]) -> int:
 
 def algorithms() -> list[Row]:
     """Algorithms and what each is, with the ensemble form of each."""
-    from pacesetter.algorithms import TABLE, names, plugins, single_member
+    from pacesetter.algorithms import TABLE, multi_names, plugins
 
     rows = {name: entry.help for name, entry in TABLE.items()} | plugins()
-    several = [name for name in names() if not single_member(name)]
-    rows |= {f"multi-{name}": f"{name} with --members 2 --rule best" for name in several}
+    several = multi_names().items()
+    rows |= {multi: f"{name} with --members 2 --rule best" for multi, name in several}
     return [{"name": name, "help": about} for name, about in rows.items()]
 
 

@@ -1,9 +1,9 @@
 """The verb `live`."""
 
 import signal
-import sys
 
 from pacesetter.cli.flags import parser
+from pacesetter.errors import tell
 from pacesetter.runs import RunDirectory, find_each
 
 
@@ -29,7 +29,7 @@ def live(words: list[str]) -> int:
     runs = named()
     for each in curves(runs):  # damaged ones are told here, not only in the browser
         if "fault" in each:
-            print(f"pacesetter: left out: {each['fault']}", file=sys.stderr)
+            tell(f"left out: {each['fault']}")
     try:
         with serving(named, found.port) as server:
             page = f"http://127.0.0.1:{server.server_port}"

@@ -15,7 +15,7 @@ from pacesetter.cli.share import export, fetch, push
 from pacesetter.cli.show import show
 from pacesetter.cli.train import resume, train
 from pacesetter.cli.tune import tune
-from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.errors import TrainingError, UsageError, tell, unknown
 from pacesetter.process import Interrupted, exit_code, forget_jax_settings
 
 VERBS: dict[str, Callable[[list[str]], int]] = {
@@ -46,21 +46,21 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return _run(sys.argv[1:] if arguments is None else arguments)
     except UsageError as error:
-        print(f"pacesetter: {error}", file=sys.stderr)
+        tell(str(error))
         return error.code
     except TrainingError as error:
-        print(f"pacesetter: stopped: {error}", file=sys.stderr)
+        tell(f"stopped: {error}")
         return error.code
     except MemoryError as error:
         less = "ask for less, such as fewer members or a smaller batch"
-        print(f"pacesetter: stopped: out of memory: {error}; {less}", file=sys.stderr)
+        tell(f"stopped: out of memory: {error}; {less}")
         return 1
     except Interrupted as signal:
         return exit_code([*signal.args])
     except KeyboardInterrupt:
         return exit_code([SIGINT])
     except OSError as error:
-        print(f"pacesetter: stopped: {error}", file=sys.stderr)
+        tell(f"stopped: {error}")
         return 1
 
 
@@ -77,7 +77,7 @@ def _run(words: list[str]) -> int:
         raise unknown("verb", words[0], VERBS, see="pacesetter --help")
     if ignored := forget_jax_settings():
         why = "the numbers of a seed may depend on what JAX is told there"
-        print(f"pacesetter: ignored {', '.join(ignored)}: {why}", file=sys.stderr)
+        tell(f"ignored {', '.join(ignored)}: {why}")
     return VERBS[words[0]](words[1:])
 
 

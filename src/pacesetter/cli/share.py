@@ -6,7 +6,8 @@ from pathlib import Path
 from pacesetter.cli.flags import parser
 from pacesetter.cli.policies import add_run, add_seed, parse
 from pacesetter.cli.streams import aside
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
+from pacesetter.policy import FILE
 
 TARGETS = "onnx (a model for any runtime), minari (a data set), sb3 (a script)"
 
@@ -62,8 +63,7 @@ def fetch(words: list[str]) -> int:
     add = command.add_argument
     add("repo", metavar="REPO_ID", help="where from, such as USER/cheetah")
     add("-o", metavar="FILE", help="a .safetensors (default NAME.safetensors of USER/NAME)")
-    name = "name of the file there (default policy.safetensors)"
-    add("--file", default="policy.safetensors", metavar="NAME", help=name)
+    add("--file", default=FILE, metavar="NAME", help=f"name of the file there (default {FILE})")
     add("--revision", metavar="REV", help="branch, tag or commit (default the newest)")
     given = command.parse(words)
     file = Path(given.o or f"{given.repo.split('/')[-1]}.safetensors")
@@ -71,10 +71,8 @@ def fetch(words: list[str]) -> int:
     from pacesetter.media.hub import load_from_hub
 
     policy = load_from_hub(given.repo, given.file, revision=given.revision)
-    try:
+    with writing("fetch", file):
         policy.save(file)
-    except OSError as error:
-        raise UsageError(f"fetch: cannot write {file}: {error.strerror}") from None
     about = policy.about
     see = shlex.join(["pacesetter", "eval", str(file)])
     made = f"{about.get('algorithm', 'a policy')} on {about.get('env', 'no named task')}"

@@ -1,7 +1,6 @@
 """The verbs `train` and `resume`."""
 
 import shlex
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 from pacesetter import consent
 from pacesetter.cli.flags import RUNS, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
+from pacesetter.errors import tell
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import fields_of
@@ -139,11 +139,11 @@ def _run(begin: Callable[[list[str]], Command], words: list[str]) -> int:
         trainer, quiet, log = begin(words)
         trainers.append(trainer)
         for note in (*trainer.notes, *([SPENT] if trainer.finished else ())):
-            print(f"pacesetter: {note}", file=sys.stderr)
+            tell(note)
         if received:
             trainer.stop()
         if not quiet and (line := within_warmup(trainer.config)):
-            print(f"pacesetter: {line}", file=sys.stderr)
+            tell(line)
         with (
             aside(),
             closing(trainer),

@@ -1,11 +1,11 @@
 """The verb `tune`."""
 
 import shlex
-import sys
 from typing import Any
 
 from pacesetter.cli.flags import Parser, add_settings, algorithm_and_env, parser, split_env_kwargs
 from pacesetter.cli.streams import aside
+from pacesetter.errors import tell
 from pacesetter.process import exit_code, fix_threads, stopping
 from pacesetter.settings import Settings
 
@@ -25,7 +25,7 @@ def tune(words: list[str]) -> int:
         and "warmup" not in tuning.ranges
         and (line := within_warmup(tuning.config))
     ):
-        print(f"pacesetter: {line}", file=sys.stderr)
+        tell(line)
     with aside(), stopping(tuning.stop) as received:
         tuning.run(lambda trainer: console(trainer, own["quiet"]))
     print(tuning.summary())

@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pacesetter.algorithms.contract import Array
 from pacesetter.batch import Batch
 from pacesetter.dynamics.model import Dynamics, Models, Networks, Scale, quantities
+from pacesetter.networks.mlp import Array
 
 TOGETHER = 50  # rows next to each other in time, nearly alike, so on one side
 PARTS = 5  # of so many such blocks the last is held out
+FEWEST_ROWS = TOGETHER * PARTS  # of fewer, no whole block is held out
 CHECKED = 1_000  # held-out rows predicted at once
 IMPROVEMENT = 0.01  # by this share of itself the loss must fall, as in mbrl-lib
 

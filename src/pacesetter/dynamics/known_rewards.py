@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from pacesetter.algorithms.contract import Array
 from pacesetter.dynamics.model import Known
 from pacesetter.errors import UsageError
+from pacesetter.networks.mlp import Array
 
 See = Callable[[Array], Array]  # a number (...) that an observation (..., O) shows
 HARMLESS = {"max_episode_steps", "render_mode", "width", "height", "camera_id", "camera_name"}

@@ -3,7 +3,8 @@
     s' = s + mean + deviation * change_k((s, a) in deviations)
 
 A member is one change network and one termination head; reward heads are an ensemble of their
-own, since STEVE combines each with each. Known functions of the task (known.py) replace the heads.
+own, since STEVE combines each with each. Known functions of the task (known_rewards.py) replace
+the heads.
 A pure function of pytrees each; recipes: STEVE (Buckman et al. 2018), ME-TRPO (Kurutach et al.
 2018) and, for the Gaussian form, PETS (Chua et al. 2018) as in mbrl-lib.
 
@@ -18,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pacesetter.algorithms.contract import Array
 from pacesetter.batch import Batch, Spec
 from pacesetter.networks import mlp
+from pacesetter.networks.mlp import Array
 from pacesetter.policy import OBSERVATION_LIMIT
 
 LOG_VARIANCE_RANGE = (-10.0, 0.5)  # of the scaled change, as in mbrl-lib
@@ -227,8 +228,7 @@ class Dynamics:
 
     @property
     def _adam(self) -> optax.GradientTransformation:
-        decay = [optax.add_decayed_weights(self.decay)] if self.decay else []
-        return optax.chain(*decay, optax.adam(self.learning_rate))
+        return mlp.adam(self.learning_rate, self.decay)
 
 
 def quantities(batch: Batch) -> Array:

@@ -13,7 +13,13 @@ import numpy as np
 from pacesetter.ensemble.copying import mean_state
 from pacesetter.ensemble.rules import Choice
 from pacesetter.learner.learners import Learners
-from pacesetter.learner.tree_arrays import below, flatten, rebuild
+from pacesetter.learner.tree_arrays import (
+    below,
+    flatten,
+    policy_tree,
+    rebuild,
+    rebuilt_policy,
+)
 from pacesetter.policy import Policy, unstack
 from pacesetter.settings.ensemble import Ensemble
 from pacesetter.settings.validation import Natural, check
@@ -84,7 +90,9 @@ class Averages:
             del self.snapshots[: -self.run.snapshots]
 
     def arrays(self) -> Arrays:
-        return flatten({"ema": self.ema, "snapshots": [_parts(each) for each in self.snapshots]})
+        return flatten(
+            {"ema": self.ema, "snapshots": [policy_tree(each) for each in self.snapshots]}
+        )
 
     def table(self) -> dict[str, Any]:
         return {"ema": [ema is not None for ema in self.ema], "snapshots": len(self.snapshots)}
@@ -101,14 +109,9 @@ class Averages:
         ]
         self.snapshots = []
         for i in range(saved.snapshots):
-            parts = rebuild(_parts(self.like), below(f"snapshots.{i}", arrays))
-            self.snapshots.append(replace(self.like, actors=parts[0], normalizer=parts[1]))
+            self.snapshots.append(rebuilt_policy(self.like, below(f"snapshots.{i}", arrays)))
 
 
 def mean_action(policies: Sequence[Policy]) -> Callable[[Floats], Floats]:
     """Acts by the mean of all policies' actions in [-1, 1]."""
     return lambda observation: np.mean([each.act(observation) for each in policies], axis=0)
-
-
-def _parts(policy: Policy) -> Any:
-    return policy.actors, policy.normalizer

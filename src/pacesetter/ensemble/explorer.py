@@ -1,4 +1,4 @@
-"""One env, the episode that runs in it, and the noise of whoever explores it."""
+"""One env: its episode, the noise of whoever explores it, and the policy that a run keeps of it."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -10,9 +10,11 @@ from pacesetter.algorithms.contract import Learner
 from pacesetter.batch import Transition
 from pacesetter.envs import Environment, Snapshot
 from pacesetter.errors import TrainingError
+from pacesetter.learner.normalizer import Normalizer
 from pacesetter.learner.scales import scaled
 from pacesetter.learner.tree_arrays import flatten, rebuild
 from pacesetter.networks.forward import clip
+from pacesetter.policy import Policy, unstack
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings.validation import Finite, Natural, check
 from pacesetter.types import ALLOWED, LARGEST, Arrays, Floats
@@ -84,6 +86,15 @@ class Explorer:
             mask=self.learner.mask(self.mask_stream),
             earned=earned,
         )
+
+    def policy(self, state: Any, normalizer: Normalizer) -> Policy:
+        """What acts without noise from a learner's state, in an env like this one."""
+        actors, env = self.learner.policy(state), self.env
+        return Policy(
+            unstack(actors.layers), actors.activation, actors.output, env.low, env.high,
+            normalizer.statistics() if normalizer.enabled else None,
+            shapes=(env.observation_shape, env.action_shape),
+        )  # fmt: skip
 
     @property
     def _running(self) -> bool:

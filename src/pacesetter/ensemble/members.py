@@ -103,8 +103,8 @@ class Members:
 
     def current_policy(self, member: int) -> Policy:
         """A member's policy as it is now."""
-        statistics = self.experience.normalizer.statistics()
-        return self.learners.policy(member, self.explorers[member].env, statistics)
+        normalizer = self.experience.normalizer
+        return self.explorers[member].policy(self.learners.states[member], normalizer)
 
     # Collect: i is the number of an env, k that of its member.
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from pacesetter.ensemble.rules import Parents
-from pacesetter.learner.tree_arrays import below, flatten, rebuild
+from pacesetter.learner.tree_arrays import below, flatten, policy_tree, rebuilt_policy
 from pacesetter.policy import Policy
 from pacesetter.settings.validation import Natural, check
 from pacesetter.types import Arrays
@@ -119,7 +119,7 @@ class PolicyCheckpoints:
         return values
 
     def arrays(self) -> Arrays:
-        return flatten([policy and _parts(policy) for policy in self.kept])
+        return flatten([policy and policy_tree(policy) for policy in self.kept])
 
     def table(self) -> dict[str, Any]:
         return {
@@ -138,9 +138,5 @@ class PolicyCheckpoints:
         for k, about in enumerate(table["kept"]):
             self.kept[k] = None
             if about is not None:
-                actors, normalizer = rebuild(_parts(self.like), below(str(k), arrays))
-                self.kept[k] = replace(self.like, actors=actors, normalizer=normalizer, about=about)
-
-
-def _parts(policy: Policy) -> Any:
-    return policy.actors, policy.normalizer
+                kept = rebuilt_policy(self.like, below(str(k), arrays))
+                self.kept[k] = replace(kept, about=about)

@@ -119,11 +119,12 @@ class Progress:
         self.updates += updates
         self.transitions += updates * batch_size
 
-    def add_losses(self, names: Sequence[str], losses: Floats, who: str = "") -> None:
+    def add_losses(self, names: Sequence[str], losses: Floats, member: int) -> None:
         """Add the losses of one update to what the next row averages, if none has diverged."""
         for name, loss in zip(names, losses.tolist(), strict=True):
             if not abs(loss) <= DIVERGED:
-                raise TrainingError(f"{who}step {self.step}: {name} is {loss}; {DIVERGENCE}")
+                where = f"member {member}, step {self.step}"
+                raise TrainingError(f"{where}: {name} is {loss}; {DIVERGENCE}")
             self.losses[name] = self.losses.get(name, 0.0) + loss
         self.summed += 1
 

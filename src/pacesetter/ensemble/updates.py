@@ -1,7 +1,6 @@
 """The updates of the members, each on minibatches of its own."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -9,6 +8,7 @@ from pacesetter.config import Config
 from pacesetter.ensemble.averages import Averages
 from pacesetter.ensemble.experience import Experience
 from pacesetter.ensemble.progress import Progress
+from pacesetter.learner.compiled import UpdateInputs
 from pacesetter.learner.learners import Learners
 from pacesetter.learner.schedule import factors
 from pacesetter.replay.buffer import Sample
@@ -36,15 +36,15 @@ class Updates:
         samples = [self._sample(k) for k in members]
         statistics, returns = self.experience.normalizer.statistics(), self.experience.returns
         extra = {"return_deviation": returns.deviation} if returns else None
-        inputs: list[Any] = []
+        inputs: list[UpdateInputs] = []
         for k, sample in zip(members, samples, strict=True):
             member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
             made = member.update_calls * self.per_call
             scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
-            inputs.append((member.update_calls, *data, extra, scales))
+            inputs.append(UpdateInputs(member.update_calls, *data, extra, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):
-            self.progress.add_losses(self.learners.loss_names, result.losses, f"member {k}, ")
+            self.progress.add_losses(self.learners.loss_names, result.losses, k)
             self.experience.replay(k).feedback(sample.numbers, np.asarray(result.td_error))
             self.progress.members[k].update_calls += 1
             if self.progress.members[k].update_calls % CHECK_EVERY == 0:

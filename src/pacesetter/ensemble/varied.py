@@ -10,10 +10,10 @@ import numpy as np
 
 from pacesetter.ensemble.rules import Choice
 from pacesetter.errors import UsageError
-from pacesetter.learner.scales import VARIABLE, scale_of, value_of
+from pacesetter.learner.scales import scale_of, value_of
 from pacesetter.learner.schedule import learning_rates
 from pacesetter.seeding import Stream, generator
-from pacesetter.settings.ensemble import Ensemble
+from pacesetter.settings.ensemble import VARIABLE, Ensemble
 from pacesetter.settings.validation import build
 
 Scales = dict[str, float]  # factors of one member's settings

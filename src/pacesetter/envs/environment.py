@@ -119,14 +119,14 @@ class Environment:
         return Snapshot(self.episode, actions, self.observation)
 
     def restore(self, snapshot: Snapshot) -> bool:
-        """Replay the snapshot's episode; False if the env does not repeat it exactly."""
+        """Replay the snapshot's episode, which still ran; False if the env does not repeat it
+        exactly.
+        """
         self.reset(snapshot.episode)
         for action in snapshot.actions:
             if self.step(action).ended:
-                break
-        return np.array_equal(self.observation, snapshot.observation) and len(self.actions) == len(
-            snapshot.actions
-        )
+                return False
+        return np.array_equal(self.observation, snapshot.observation)
 
     def close(self) -> None:
         self._call("close", self.env.close)

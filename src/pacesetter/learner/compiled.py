@@ -19,12 +19,11 @@ from optax import incremental_update
 
 from pacesetter.algorithms.contract import Array, Learner, State
 from pacesetter.batch import Layout
-from pacesetter.envs import Environment
 from pacesetter.learner import products
 from pacesetter.learner.normalizer import Statistics
 from pacesetter.learner.precision import bfloat16_products
 from pacesetter.learner.scales import scaled
-from pacesetter.policy import OBSERVATION_LIMIT, Policy, unstack
+from pacesetter.policy import OBSERVATION_LIMIT
 from pacesetter.seeding import Stream, generator
 from pacesetter.settings.values import chosen
 from pacesetter.types import Floats
@@ -37,6 +36,17 @@ class KeyUse(IntEnum):
 
     INIT = 0
     UPDATE = 1
+
+
+class UpdateInputs(NamedTuple):
+    """What one call of a member's update takes besides its state."""
+
+    call: int
+    rows: Floats  # (U, B, width)
+    weight: Floats | None
+    statistics: Statistics
+    extra: dict[str, Any] | None = None  # fields of the batch that are not in rows
+    scales: dict[str, float] | None = None  # factors of settings that differ between members
 
 
 class MemberUpdate(NamedTuple):
@@ -61,7 +71,7 @@ class CompiledLearner:
         seen: NDArray[np.bool_] | None = None,
     ) -> None:
         """`seen` (O,) tells what the actor sees of an observation; None is all of it."""
-        self.learner, self.layout, self.normalize = learner, layout, normalize
+        self.learner, self.layout = learner, layout
         self.key = jax.random.key(seed)
         self._init = jax.jit(lambda key, member: learner.init(_key(key, KeyUse.INIT, 0, member)))
         self._policy_params = jax.jit(learner.policy_params)
@@ -88,38 +98,27 @@ class CompiledLearner:
         """What each member acts with, as NumPy arrays that no later update touches."""
         return [jax.tree.map(np.array, self._policy_params(state)) for state in states]
 
-    def update(
-        self,
-        state: State,
-        member: int,
-        call: int,
-        rows: Floats,
-        weight: Floats | None,
-        statistics: Statistics,
-        extra: dict[str, Any] | None = None,
-        scales: dict[str, float] | None = None,
-    ) -> MemberUpdate:
-        """One call of a member's update on rows (U, B, width); the given state is used up.
+    def update(self, state: State, member: int, inputs: UpdateInputs) -> MemberUpdate:
+        """One call of a member's update; the given state is used up.
 
-        `extra` are fields of the batch that are not in rows, and `scales` factors of settings
-        that differ between members. Members may be called from threads.
+        Members may be called from threads.
         """
+        call, rows, weight, statistics, extra, scales = inputs
         key = self._keys(member, call // KEYS)[call % KEYS]
-        inputs = (rows, weight, statistics, extra or {}, scales or {})
-        state, losses, td_error, params = self._update(state, *inputs, key)
+        data = (rows, weight, statistics, extra or {}, scales or {})
+        state, losses, td_error, params = self._update(state, *data, key)
         return MemberUpdate(
             state, np.asarray(losses), td_error, params
         )  # NumPy waits for the result
 
-    def loss_names(self, state: State, call: int, *inputs: Any) -> list[str]:
+    def loss_names(self, state: State, inputs: UpdateInputs) -> list[str]:
         """Names of the losses, in order, for the inputs of an update; only their shapes matter."""
-        rows, weight, statistics, extra, *_ = *inputs, None
 
         def losses(state: State, rows: Array, extra: dict[str, Any]) -> dict[str, Array]:
-            batch = self._program.batch(rows, weight, statistics, extra)
+            batch = self._program.batch(rows, inputs.weight, inputs.statistics, extra)
             return self.learner.update(state, batch, self.key).losses
 
-        return sorted(jax.eval_shape(losses, state, rows, extra or {}))
+        return sorted(jax.eval_shape(losses, state, inputs.rows, inputs.extra or {}))
 
     def actors(self, state: State) -> Any:
         """The layers of what acts without noise."""
@@ -128,16 +127,6 @@ class CompiledLearner:
     def ema_actors(self, ema: Any, state: State, tau: float) -> Any:
         """Such layers, a step of size `tau` nearer to what they are in a state now."""
         return self._ema_actors(ema, state, tau)
-
-    def policy(self, state: State, env: Environment, statistics: Statistics) -> Policy:
-        """What acts without noise in an env like this one, in NumPy alone."""
-        actors = self.learner.policy(state)
-        scale = statistics if self.normalize else None
-        layers = unstack(actors.layers)
-        return Policy(
-            layers, actors.activation, actors.output, env.low, env.high, scale,
-            shapes=(env.observation_shape, env.action_shape),
-        )  # fmt: skip
 
 
 class _Program(NamedTuple):

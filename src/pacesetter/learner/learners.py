@@ -9,12 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pacesetter.algorithms.contract import State
-from pacesetter.envs import Environment
 from pacesetter.errors import TrainingError
-from pacesetter.learner.compiled import CompiledLearner, MemberUpdate
-from pacesetter.learner.normalizer import Statistics
+from pacesetter.learner.compiled import CompiledLearner, MemberUpdate, UpdateInputs
 from pacesetter.learner.tree_arrays import flatten, rebuild
-from pacesetter.policy import Policy
 from pacesetter.process import threads
 from pacesetter.seeding import Stream, generator
 from pacesetter.types import DIVERGED, DIVERGENCE, Arrays, worst
@@ -38,15 +35,13 @@ class Learners:
         self.states = [self.compiled.blinded(state) for state in states]
         self.policy_params = self.compiled.policy_params(self.states)
 
-    def update(self, members: Sequence[int], inputs: Sequence[Any]) -> list[MemberUpdate]:
-        """One call of the update of each of these members; inputs are those of `compiled.update`
-        after the member.
-        """
+    def update(self, members: Sequence[int], inputs: Sequence[UpdateInputs]) -> list[MemberUpdate]:
+        """One call of the update of each of these members."""
         if not self.loss_names:
-            self.loss_names = self.compiled.loss_names(self.states[members[0]], *inputs[0])
+            self.loss_names = self.compiled.loss_names(self.states[members[0]], inputs[0])
 
-        def one(k: int, given: Any) -> MemberUpdate:
-            return self.compiled.update(self.states[k], k, *given)
+        def one(k: int, given: UpdateInputs) -> MemberUpdate:
+            return self.compiled.update(self.states[k], k, given)
 
         run = map if len(members) == 1 else self.workers.map
         results = list(run(one, members, inputs))
@@ -63,10 +58,6 @@ class Learners:
                     raise TrainingError(
                         f"member {k}, step {step}: {name} holds {found}; {DIVERGENCE}"
                     )
-
-    def policy(self, member: int, env: Environment, statistics: Statistics) -> Policy:
-        """A member's policy as it is now, for an env like this one."""
-        return self.compiled.policy(self.states[member], env, statistics)
 
     def ledger(self, updates: int, actions: int) -> dict[str, int]:
         """What so many updates and actions cost besides the members' own."""

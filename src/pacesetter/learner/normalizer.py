@@ -23,11 +23,7 @@ class Normalizer:
         """Add one observation (O,)."""
         if not self.enabled:
             return
-        count, mean, squares = self.sums
-        count += 1
-        change = observation - mean
-        mean += change / count
-        squares += change * (observation - mean)
+        _add(self.sums, observation)
         self._statistics = None
 
     def statistics(self) -> Statistics:
@@ -72,10 +68,7 @@ class ReturnScale:
     def add(self, env: int, reward: float, last: bool) -> None:
         """Add a step of an env."""
         self.running[env] = total = self.gamma * self.running[env] + reward
-        self.sums[0] += 1
-        change = total - self.sums[1]
-        self.sums[1] += change / self.sums[0]
-        self.sums[2] += change * (total - self.sums[1])
+        _add(self.sums, total)
         if last:
             self.running[env] = 0.0
 
@@ -95,3 +88,11 @@ class ReturnScale:
         """The inverse of `arrays`."""
         found = rebuild({"running": self.running, "sums": self.sums}, arrays)
         self.running, self.sums = found["running"].copy(), found["sums"].copy()
+
+
+def _add(sums: Reals, value: Any) -> None:
+    """One value more for count, mean and squared deviations (3, ...), in place (Welford)."""
+    sums[0] += 1
+    change = value - sums[1]
+    sums[1] += change / sums[0]
+    sums[2] += change * (value - sums[1])

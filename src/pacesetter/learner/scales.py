@@ -8,11 +8,6 @@ compiled update, so that it is compiled once for all members.
 import copy
 from typing import Any
 
-VARIABLE = (
-    *("actor_learning_rate", "critic_learning_rate", "alpha_learning_rate"),
-    *("gamma", "exploration_noise"),
-)
-
 
 def value_of(name: str, base: Any, scale: Any) -> Any:
     """A setting's value, from its factor."""

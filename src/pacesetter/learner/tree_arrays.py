@@ -1,10 +1,12 @@
 """Trees of arrays as the flat, named arrays of a checkpoint, and back."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 
+from pacesetter.policy import Policy
 from pacesetter.types import Arrays
 
 
@@ -24,6 +26,17 @@ def rebuild(like: Any, arrays: Arrays) -> Any:
         return array
 
     return jax.tree_util.tree_map_with_path(find, like)
+
+
+def policy_tree(policy: Policy) -> Any:
+    """The arrays of a policy that are learned."""
+    return policy.actors, policy.normalizer
+
+
+def rebuilt_policy(like: Policy, arrays: Arrays) -> Policy:
+    """A policy like another, with the arrays of `policy_tree`."""
+    actors, normalizer = rebuild(policy_tree(like), arrays)
+    return replace(like, actors=actors, normalizer=normalizer)
 
 
 def below(prefix: str, arrays: Arrays) -> Arrays:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
 from pacesetter.files import replacing
 from pacesetter.runs import Row, RunDirectory
 
@@ -28,11 +28,8 @@ def curve(run: RunDirectory, path: str | Path) -> None:
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     if path.suffix.removeprefix(".") not in canvas.get_supported_filetypes():
         raise UsageError(f"curve: cannot draw {path}: its name must end in .png, .svg or .pdf")
-    try:
-        with replacing(path) as file:
-            figure.savefig(file)
-    except OSError as error:
-        raise UsageError(f"curve: cannot write {path}: {error.strerror}") from None
+    with writing("curve", path), replacing(path) as file:
+        figure.savefig(file)
 
 
 def _dots(axes: Any, rows: list[Row]) -> None:

@@ -35,7 +35,7 @@ def export(
     match to:
         case "onnx":
             found = to_onnx(policy, path)
-            inputs, outputs = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+            inputs, outputs = policy.observation_size, len(policy.low)
             return (
                 f"{path}: observations (batch, {inputs}) to actions (batch, {outputs}) in the "
                 f"env's units; onnxruntime gives the policy's actions to {found.exact:.1e} of "

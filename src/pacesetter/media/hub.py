@@ -8,14 +8,14 @@ from typing import Any
 from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import Evaluation, evaluate, recipe_of
+from pacesetter.extras import need
 from pacesetter.files import present
-from pacesetter.media.extras import need
-from pacesetter.policy import Policy, load
+from pacesetter.policy import FILE, Policy, load
 from pacesetter.runs import RunDirectory
 from pacesetter.text import markdown, printable
 
 INSTALL = "pacesetter[hub]"
-FILE, CARD, VIDEO = "policy.safetensors", "README.md", "replay.mp4"  # the hub plays a replay.mp4
+CARD, VIDEO = "README.md", "replay.mp4"  # the hub plays a replay.mp4
 USE = """```python
 from pacesetter.media.hub import load_from_hub
 

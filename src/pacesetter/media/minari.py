@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from pacesetter.envs import Environment, Recipe
-from pacesetter.errors import UsageError, reason
+from pacesetter.errors import UsageError, reason, writing
 from pacesetter.evaluation import enter
-from pacesetter.media.extras import need
+from pacesetter.extras import need
 from pacesetter.media.scene import setting
 from pacesetter.policy import Policy, to_env
 from pacesetter.seeding import episode_seed
@@ -44,6 +44,7 @@ def to_minari(
         returns = [float(np.sum(buffer["rewards"])) for buffer in buffers]
         kind = need("minari", "minari.data_collector", INSTALL).EpisodeBuffer
         with (
+            writing("minari", path),
             TemporaryDirectory(dir=path.parent.resolve()) as root,  # it joins a relative to itself
             setting("MINARI_DATASETS_PATH", root),
             warnings.catch_warnings(),
@@ -59,8 +60,6 @@ def to_minari(
                 description=_describe(policy, world.name, returns, seed),
             )
             Path(root, path.name).rename(path)
-    except OSError as error:
-        raise UsageError(f"minari: cannot write {path}: {error.strerror or error}") from None
     except ValueError as error:  # such as a space that it has no form for
         raise UsageError(f"minari: cannot write {path}: {reason(error)}") from None
     finally:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
+from pacesetter.extras import need
 from pacesetter.files import write_atomically
-from pacesetter.media.extras import need
 from pacesetter.networks.forward import (
     ACTIVATIONS,
     ENCODER,
@@ -45,10 +45,8 @@ def to_onnx(policy: Policy, path: Path) -> Checked:
         raise UsageError(f"onnx: {path} must end in .onnx")
     model = build(policy)
     found = check(policy, model, build(policy, np.float64))
-    try:
+    with writing("onnx", path):
         write_atomically(path, model)
-    except OSError as error:
-        raise UsageError(f"onnx: cannot write {path}: {error.strerror}") from None
     return found
 
 
@@ -78,7 +76,7 @@ def build(policy: Policy, dtype: Any = np.float32) -> bytes:
     """The serialised model; float64 is for checking its arithmetic."""
     onnx, graph = need("onnx", "onnx", INSTALL), Graph(dtype)
     helper, kind = graph.helper, graph.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
-    inputs, outputs = policy.actors[0][0]["kernel"].shape[0], len(policy.low)
+    inputs, outputs = policy.observation_size, len(policy.low)
     actions = [_actor(graph, policy, layers, _input(graph, policy)) for layers in policy.actors]
     share = _bounds(graph, policy, _mean(graph, actions))
     graph.nodes.append(helper.make_node("Identity", [share], ["action"]))
@@ -203,7 +201,7 @@ def check(policy: Policy, model: bytes, twin: bytes) -> Checked:
 
 def observations(policy: Policy) -> tuple[Floats, Floats]:
     """Ordinary ones, in the units of the normaliser, and ones from zero to far beyond any task."""
-    size, rng = policy.actors[0][0]["kernel"].shape[0], np.random.default_rng(0)
+    size, rng = policy.observation_size, np.random.default_rng(0)
     mean, deviation = policy.normalizer or (np.zeros(size), np.ones(size))
     random = mean + deviation * rng.normal(size=(252, size))
     corners = [rng.choice([-1.0, 0.0, 1.0], (21, size)) * scale for scale in (1.0, 1e2, 1e4, 1e6)]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pacesetter.envs import Environment, Recipe
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
 from pacesetter.files import replacing
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene
 from pacesetter.policy import Policy
@@ -116,9 +116,6 @@ def _save(path: Path, pictures: list[Frame], steps: list[int]) -> None:
         left = n * (width + GAP)
         strip.paste(Image.fromarray(picture), (left, 0))
         pen.text((left + width / 2, height + letters), f"step {step:,}", "black", font, "mm")
-    try:
-        # 256 colours without dithering: a third of the bytes, and nobody sees it.
-        with replacing(path) as file:
-            strip.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
-    except OSError as error:
-        raise UsageError(f"poster: cannot write {path}: {error.strerror}") from None
+    # 256 colours without dithering: a third of the bytes, and nobody sees it.
+    with writing("poster", path), replacing(path) as file:
+        strip.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)

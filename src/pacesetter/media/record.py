@@ -10,7 +10,6 @@ from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.files import replacing
 from pacesetter.media.caption import caption
-from pacesetter.media.scene import INSTALL as INSTALL
 from pacesetter.media.scene import Frame, check_folder, check_size, draw, scene, setting
 from pacesetter.policy import Policy
 

@@ -6,7 +6,7 @@ from typing import Any
 from pacesetter.consent import require
 from pacesetter.envs import Recipe
 from pacesetter.envs.tasks import FUNCTION
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
 from pacesetter.evaluation import recipe_of
 from pacesetter.files import write_atomically
 from pacesetter.policy import Floats, Policy
@@ -86,9 +86,10 @@ def to_sb3(
     imports = f"from math import {', '.join(odd)}\n" if odd else ""
     text = SCRIPT.format(task=words, imports=imports)
     try:
-        policy.save(file)
-        write_atomically(path, text.encode())
-    except OSError as error:
+        with writing("sb3", path):
+            policy.save(file)
+            write_atomically(path, text.encode())
+    except UsageError:
         file.unlink(missing_ok=True)
-        raise UsageError(f"sb3: cannot write {path}: {error.strerror}") from None
+        raise
     return file

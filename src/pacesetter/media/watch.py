@@ -13,7 +13,7 @@ from typing import Any
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.evaluation import enter, recipe_of
-from pacesetter.media.extras import need
+from pacesetter.extras import need
 from pacesetter.media.scene import FOLLOW, camera_number, is_mujoco, lay_floor
 from pacesetter.policy import Policy
 from pacesetter.types import Floats

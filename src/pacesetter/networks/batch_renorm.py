@@ -122,21 +122,19 @@ def _outputs(layer: Layer, norm: Norm, x: Array, is_input: bool) -> Array:
     return x @ (gain[:, None] * layer["kernel"]) + (shift @ layer["kernel"] + layer["bias"])
 
 
-def unit_length(network: Network, head: bool) -> Network:
+def unit_length(network: Network) -> Network:
     """The network with the weights into every hidden unit, its bias among them, at length 1.
 
     Batch norm behind the unit cancels their length, which only decides how far a step of Adam
-    turns them. With `head` the weights into every output too, but not its bias.
+    turns them. That of the head is the size of the values, which nothing behind it cancels.
     """
-    hidden = [_unit_length(layer, with_bias=True) for layer in network[:-1]]
-    return (*hidden, _unit_length(network[-1], with_bias=False) if head else network[-1])
+    return (*map(_unit_length, network[:-1]), network[-1])
 
 
-def _unit_length(layer: Layer, with_bias: bool) -> Layer:
+def _unit_length(layer: Layer) -> Layer:
     kernel, bias = layer["kernel"], layer["bias"]
-    length = jnp.sqrt((kernel**2).sum(axis=-2) + (bias**2 if with_bias else 0))
-    divided = layer | {"kernel": kernel / length[..., None, :]}
-    return divided | {"bias": bias / length} if with_bias else divided
+    length = jnp.sqrt((kernel**2).sum(axis=-2) + bias**2)
+    return layer | {"kernel": kernel / length[..., None, :], "bias": bias / length}
 
 
 def with_statistics(network: Network, trained: Network) -> Network:

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-Array = jax.Array
+from pacesetter.networks.mlp import Array
+
 LAP_KINK = 1.0  # where LAP's loss turns from square to linear, and its smallest priority
 KAPPA = 1.0  # the same for quantiles
 BINS_LIMIT = 5.0  # the return of the last bin, in units of the returns' standard deviation
@@ -30,6 +31,13 @@ class Head(NamedTuple):
     outputs: int
     value: Callable[[Array], Array]
     loss: Callable[[Array, Array], tuple[Array, Array]]
+
+    def weighted_loss(self, outputs: Array, target_q: Array, weight: Array) -> tuple[Array, Array]:
+        """The weighted mean loss, summed over critics (N, B, M), and each transition's largest
+        |TD error| (B,); weights are (B,) or (N, B).
+        """
+        losses, td_error = self.loss(outputs, target_q)
+        return (weight * losses).mean(axis=1).sum(), td_error.max(axis=0)
 
     def min_q(self, outputs: Array) -> Array:
         """Of N critics' outputs (N, B, M), those of the critic with the lowest value.

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, ValidationInfo
 
 from pacesetter.networks import mlp
 from pacesetter.networks.forward import forward
+from pacesetter.networks.mlp import Array
 from pacesetter.types import Floats, Layers
 
 OU_PULL = 0.15
@@ -18,7 +19,7 @@ ADAPT_EVERY = 50  # updates of a learner between two adaptations of its paramete
 ADAPT_FACTOR = 1.01
 SIGMA_RANGE = (1e-4, 1.0)  # where tanh saturates, distance no longer tells of sigma
 NOISY = ("kernel", "bias")  # and not the gains of layer norm
-Array = jax.Array
+
 Rng = np.random.Generator
 
 

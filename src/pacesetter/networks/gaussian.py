@@ -6,10 +6,10 @@ import numpy as np
 
 from pacesetter.networks import mlp
 from pacesetter.networks.forward import clip, forward
+from pacesetter.networks.mlp import Array
 from pacesetter.policy import Actors
 from pacesetter.types import Floats, Layers
 
-Array = jax.Array
 LOG_STD_RANGE = (-20.0, 2.0)
 
 

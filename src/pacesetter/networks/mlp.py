@@ -131,6 +131,12 @@ def each(one: Callable[..., Any], networks: Network, *inputs: Array) -> Any:
     return jax.vmap(one)(networks, *own)
 
 
+def adam(learning_rate: float, decay: float = 0.0) -> optax.GradientTransformation:
+    """Adam; with `decay`, weights times it are added to the gradient (L2)."""
+    decayed = [optax.add_decayed_weights(decay)] if decay else []
+    return optax.chain(*decayed, optax.adam(learning_rate))
+
+
 def apply_gradient(
     optimizer: optax.GradientTransformation, params: Any, gradient: Any, opt_state: Any
 ) -> tuple[Any, Any]:

@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.sparse.linalg import cg
 
-from pacesetter.algorithms.contract import Array
 from pacesetter.networks import mlp
+from pacesetter.networks.mlp import Array
 
 
 class Gaussian(NamedTuple):
@@ -57,6 +58,24 @@ def fisher_product(
         return transposed((weighted, 2 * log_std_change))[0]
 
     return product
+
+
+def natural_step(
+    fisher: Callable[[Array], Array],
+    gradient: Array,
+    damping: float,
+    max_kl: float,
+    iterations: int,
+) -> Array:
+    """The step along the natural gradient whose KL, by its quadratic model, is `max_kl`."""
+
+    def damped(vector: Array) -> Array:
+        return fisher(vector) + damping * vector
+
+    direction, _ = cg(damped, gradient, tol=1e-6, maxiter=iterations)
+    # Without a gradient there is no direction, and no 0 / 0 either.
+    curvature = jnp.maximum(direction @ damped(direction), jnp.finfo(jnp.float32).tiny)
+    return jnp.sqrt(2 * max_kl / curvature) * direction
 
 
 def line_search(

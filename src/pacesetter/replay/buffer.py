@@ -17,12 +17,12 @@ from pacesetter.files import make_folder, regular, reserve
 from pacesetter.replay.by_return import ByReturn
 from pacesetter.replay.prioritized import MEASURES, ByError
 from pacesetter.replay.sampler import Sampler
+from pacesetter.settings import MAX_ROWS_PER_TICK
 from pacesetter.storage import digest
 from pacesetter.types import Arrays, Floats, Numbers
 
 BLOCK = 4096  # rows hashed together
 UNCOMMITTED = 32_768  # rows that may be added between two checkpoints
-MAX_ROWS_PER_TICK = 1_000  # of all members together, before the next checkpoint
 SLACK = 2 * (UNCOMMITTED + MAX_ROWS_PER_TICK) + BLOCK
 
 

@@ -1,4 +1,4 @@
-"""Run directories: their files, what a result needs to be repeated, and what a run may spend."""
+"""Run directories: their files, and what a result needs to be repeated."""
 
 from pacesetter.runs.directory import (
     FREE_PER_SEED,

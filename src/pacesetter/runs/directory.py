@@ -21,6 +21,7 @@ from pacesetter.files import (
     read_bytes,
     write_atomically,
 )
+from pacesetter.policy import FILE
 from pacesetter.runs.lock import WITHOUT, Lock
 from pacesetter.runs.log import Log, Row
 from pacesetter.runs.provenance import provenance
@@ -42,7 +43,7 @@ class RunDirectory:
         self.path = path
         self.config_file = path / CONFIG
         self.metrics_file = path / "metrics.jsonl"
-        self.policy_file = path / "policy.safetensors"
+        self.policy_file = path / FILE
         self.best_file = path / "best.safetensors"
         self.policies = path / "policies"  # of past evaluations, if they are kept
         self.state_file = path / "last" / "state.safetensors"

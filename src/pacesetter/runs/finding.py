@@ -8,6 +8,7 @@ from pathlib import Path, PurePath
 
 from pacesetter.errors import UsageError
 from pacesetter.files import present
+from pacesetter.policy import file_of
 from pacesetter.runs.directory import CONFIG, RunDirectory
 
 SHOWN = 4  # runs that a refusal names
@@ -57,8 +58,6 @@ def find(name: str, runs: str | Path = "runs") -> RunDirectory:
         raise UsageError(
             f"run: '{name}' matches {_few(found)}; give more of its path, such as ENV/NAME/SEED"
         )
-    from pacesetter.policy import file_of
-
     if file_of(name):
         raise UsageError(f"run: {name} is a policy file; give a run, which has a log and states")
     known = list(find_all(runs))

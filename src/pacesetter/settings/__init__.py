@@ -7,8 +7,8 @@ from pydantic.dataclasses import dataclass
 
 from pacesetter.settings.values import (
     Count,
+    Indices,
     LearningRate,
-    Numbers,
     SmallCount,
     Switch,
     Tau,
@@ -51,12 +51,13 @@ def _check_weights(value: object, info: ValidationInfo) -> object:
     return value
 
 
-def _check_loss(quantiles: int, info: ValidationInfo) -> int:
-    if quantiles and info.data.get("replay") == "lap":
+def check_loss(outputs: int, info: ValidationInfo) -> int:
+    """Refuse quantiles or bins with a replay that sets the loss."""
+    if outputs and info.data.get("replay") == "lap":
         raise ValueError(
             "cannot be combined with --replay lap, as each sets the loss; allowed with it: 0"
         )
-    return quantiles
+    return outputs
 
 
 def _check_assess(value: int | None, info: ValidationInfo) -> int | None:
@@ -71,7 +72,7 @@ def _check_horizon(value: int | None, info: ValidationInfo) -> int | None:
     return value
 
 
-ROWS_A_TICK = 1_000  # transitions that a replay takes at a time, of all members together
+MAX_ROWS_PER_TICK = 1_000  # transitions that a replay takes at a time, of all members together
 NORMALIZE = "normalize observations by running mean and standard deviation, clip at 10"
 REPLAY_SIZE = "transitions kept; the oldest are overwritten first"
 # Default exponents of each kind of replay: of priorities, and of importance weights.
@@ -159,7 +160,7 @@ class OffPolicy(Hyper):
     lr_horizon: Annotated[Count | None, AfterValidator(_check_horizon)] = Field(
         None, ge=1, description="env steps until that share is reached; default --steps"
     )
-    actor_observes: Numbers | None = Field(
+    actor_observes: Indices | None = Field(
         None,
         description="numbers of the flat observation that the actor sees, such as 0:17 or 0:8,12; "
         "critics see all; default all",
@@ -214,7 +215,7 @@ class ActorCritic(OffPolicy):
     actor_layer_norm: Switch = Field(
         False, description="use layer norm before each ReLU of the actor"
     )
-    quantiles: Annotated[int, AfterValidator(_check_loss)] = Field(
+    quantiles: Annotated[int, AfterValidator(check_loss)] = Field(
         0,
         ge=0,
         le=1_000,

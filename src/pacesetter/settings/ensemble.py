@@ -7,12 +7,15 @@ from pydantic.dataclasses import dataclass
 
 from pacesetter.ensemble.rules import RULES
 from pacesetter.errors import unknown
-from pacesetter.learner.scales import VARIABLE
 from pacesetter.settings import STRICT
 from pacesetter.settings.values import Count, values_by_name
 
 SELECT_EVERY = 5_000  # env steps
 WINDOWS = {"rescue": 5, "pbt": 5}  # episodes behind a selection, where the default is not one
+VARIABLE = (  # settings that may differ between members
+    *("actor_learning_rate", "critic_learning_rate", "alpha_learning_rate"),
+    *("gamma", "exploration_noise"),
+)
 SPREAD_RULES = ("rescue",)  # that need the spread of a member's own episodes
 
 

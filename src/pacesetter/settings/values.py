@@ -89,7 +89,7 @@ SmallCount = Annotated[int, Field(ge=1, le=1_000_000)]
 SmallCountOr0 = Annotated[int, Field(ge=0, le=1_000_000)]
 LARGEST_COUNTED = 2**31 - 1  # what a learner's program compares with one of its counters
 Count = Annotated[int, BeforeValidator(_count)]
-Numbers = Annotated[str, AfterValidator(_numbers)]
+Indices = Annotated[str, AfterValidator(_numbers)]
 Duration = Annotated[float, BeforeValidator(_duration)]
 LearningRate = Annotated[float, Tune(1e-4, 3e-3, log=True)]
 Tau = Annotated[float, Tune(1e-3, 0.02, log=True)]

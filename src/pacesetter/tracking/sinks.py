@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pacesetter.errors import UsageError
-from pacesetter.media.extras import need
+from pacesetter.extras import need
 from pacesetter.runs import Row
 from pacesetter.tracking.numbers import numbers
 

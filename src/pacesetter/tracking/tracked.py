@@ -3,16 +3,15 @@
 import json
 import re
 import shlex
-import sys
 import uuid
 from collections.abc import Generator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
 from pacesetter.consent import words
-from pacesetter.errors import TrainingError, UsageError, unknown
+from pacesetter.errors import TrainingError, UsageError, tell, unknown
+from pacesetter.extras import look_for
 from pacesetter.files import present, read_bytes, write_atomically
-from pacesetter.media.extras import look_for
 from pacesetter.runs import Row, RunDirectory
 from pacesetter.storage import as_json
 from pacesetter.tracking.sinks import SINKS, Tracked, Write
@@ -57,10 +56,7 @@ def tracked(directory: RunDirectory, names: Sequence[str] | None = None) -> Gene
                     give(row)
                 except Exception as error:  # of whatever kind its tool raises
                     del writes[name]
-                    print(
-                        f"pacesetter: log: {_failed(name, error)}; goes on without it",
-                        file=sys.stderr,
-                    )
+                    _say(f"{_failed(name, error)}; goes on without it")
 
         yield write
 
@@ -89,7 +85,7 @@ def _close(name: str, sink: AbstractContextManager[Write]) -> None:
 
 
 def _say(line: str) -> None:
-    print(f"pacesetter: log: {line}", file=sys.stderr)
+    tell(f"log: {line}")
 
 
 def _failed(name: str, error: Exception) -> str:

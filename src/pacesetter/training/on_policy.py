@@ -22,7 +22,7 @@ from pacesetter.ensemble.loop import Part, numbered
 from pacesetter.ensemble.progress import Progress
 from pacesetter.envs import Environment
 from pacesetter.errors import blame
-from pacesetter.learner.compiled import CompiledLearner
+from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
 from pacesetter.learner.learners import Learners
 from pacesetter.learner.normalizer import Normalizer
 from pacesetter.policy import Policy
@@ -89,7 +89,7 @@ class OnPolicyLoop:
 
     def policy(self, member: int) -> Policy:
         """The policy as it is now."""
-        return self.learners.policy(member, self.explorers[0].env, self.normalizer.statistics())
+        return self.explorers[0].policy(self.learners.states[member], self.normalizer)
 
     def averaged(self, champion: Policy) -> dict[str, list[Policy]]:
         """None: there is one member."""
@@ -125,9 +125,10 @@ class OnPolicyLoop:
         """One update after a rollout, whose observations then join the statistics."""
         progress = self.progress
         data, extra = self.source.data(rows, progress.updates)
-        inputs = (progress.updates, data, None, self.normalizer.statistics(), extra)
+        statistics = self.normalizer.statistics()
+        inputs = UpdateInputs(progress.updates, data, None, statistics, extra)
         (result,) = self.learners.update([0], [inputs])
-        progress.add_losses(self.learners.loss_names, result.losses, "member 0, ")
+        progress.add_losses(self.learners.loss_names, result.losses, 0)
         self.learners.refuse_faults([0], progress.step)
         progress.updates += 1
         progress.transitions += int(extra.get("valid", len(rows)))

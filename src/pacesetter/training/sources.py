@@ -7,6 +7,7 @@ import numpy as np
 
 from pacesetter.batch import Layout
 from pacesetter.config import Config
+from pacesetter.dynamics.fit import FEWEST_ROWS
 from pacesetter.envs import Environment, Recipe
 from pacesetter.errors import UsageError
 from pacesetter.replay.buffer import UNCOMMITTED, Replay
@@ -14,7 +15,6 @@ from pacesetter.seeding import Stream
 from pacesetter.types import Floats
 
 Data = tuple[Floats, dict[str, Any]]  # rows and the batch's other fields
-MIN_ROLLOUT = 250  # rows, of which a fifth is held out by a fit
 
 
 class LastRollout:
@@ -50,9 +50,9 @@ class AllSteps:
         self.layout, self.starts = layout, hyper.starts
         self.capacity = min(hyper.replay_size, run.steps)
         rollout = self.rollout = hyper.parallel_envs * hyper.rollout_length
-        if not MIN_ROLLOUT <= rollout <= min(UNCOMMITTED, hyper.replay_size):
+        if not FEWEST_ROWS <= rollout <= min(UNCOMMITTED, hyper.replay_size):
             raise UsageError(
-                f"rollout_length: a rollout of all envs must have {MIN_ROLLOUT} to "
+                f"rollout_length: a rollout of all envs must have {FEWEST_ROWS} to "
                 f"{min(UNCOMMITTED, hyper.replay_size)} steps, it has {rollout}"
             )
         self.size = hyper.replay_size

@@ -1,5 +1,7 @@
 """The envs that a run trains in, and how it keeps their episodes apart."""
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -8,6 +10,7 @@ from pacesetter.config import Config
 from pacesetter.envs import Environment, apart
 from pacesetter.envs.apart import Apart
 from pacesetter.envs.tasks import Factory, Recipe
+from pacesetter.errors import TaskError
 from pacesetter.seeding import Stream
 from pacesetter.settings import OnPolicy
 
@@ -19,6 +22,13 @@ class Tasks(NamedTuple):
     recipe: Recipe
     apart: Apart
     notes: list[str]
+
+
+def close_all(envs: Iterable[Environment]) -> None:
+    """Close envs after a fault, whose error is the one to be seen."""
+    for env in envs:
+        with suppress(TaskError):
+            env.close()
 
 
 def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) -> Tasks:
@@ -33,8 +43,13 @@ def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) 
     on_policy = isinstance(hyper, OnPolicy)
     count = hyper.parallel_envs if on_policy else run.members * hyper.num_envs
     world = partial(Environment, recipe, run.seed, Stream.TRAIN, ranges=run.randomize)
-    envs = [world(index=index) for index in range(count)]
-    cast = envs[0].check()
+    envs: list[Environment] = []
+    try:
+        envs.extend(world(index=index) for index in range(count))
+        cast = envs[0].check()
+    except BaseException:
+        close_all(envs)
+        raise
     notes = [] if before else cast
     if isinstance(env, str) and env != run.env:
         notes.insert(0, f"env: '{env}' has no version; taking the newest, {run.env}")

@@ -1,8 +1,8 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, nullcontext, suppress
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
@@ -27,7 +27,7 @@ from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
 from pacesetter.training.reporter import Reporter
 from pacesetter.training.starting import start_from
-from pacesetter.training.tasks import make_tasks
+from pacesetter.training.tasks import close_all, make_tasks
 
 if TYPE_CHECKING:
     from pacesetter.settings.typed import Name, TrainerSettings
@@ -67,14 +67,15 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
         self._begin(None, env)
-        start_from(self.loop, self.config, runs)
-        self.directory.create(self.config, **self._made_with)
-        try:
-            self.loop.open_replays(self.directory.state_file.parent)
-            checkpoint.save(self.loop, self.config, self.directory)
-        except BaseException:
-            self.directory.remove()
-            raise
+        with self._closed_by_a_fault():
+            start_from(self.loop, self.config, runs)
+            self.directory.create(self.config, **self._made_with)
+            try:
+                self.loop.open_replays(self.directory.state_file.parent)
+                checkpoint.save(self.loop, self.config, self.directory)
+            except BaseException:
+                self.directory.remove()
+                raise
         self.notes += [*self.directory.notes, *products.notes(self.config.hyper)]
 
     @classmethod
@@ -114,8 +115,8 @@ class Trainer:
         identity.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
         self._begin(apart.recorded(self.directory.record()), env)
-        self.directory.lock()
-        try:
+        with self._closed_by_a_fault():
+            self.directory.lock()
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
             begun = self.directory.has_checkpoint
@@ -127,9 +128,6 @@ class Trainer:
             if self.progress.step > self.budget:
                 raise UsageError(f"steps: the run has made {self.progress.step:,}; give more")
             self.directory.note_resume(self.config, self.progress.step, **self._made_with)
-        except BaseException:
-            self.directory.unlock()
-            raise
         return self
 
     def __repr__(self) -> str:
@@ -140,14 +138,27 @@ class Trainer:
     def _begin(self, before: apart.Apart | None, env: str | Factory | None) -> None:
         """Make envs and loop; a resumed run says how it kept its episodes apart `before`."""
         tasks = make_tasks(self.config, before, env)
-        self.apart = tasks.apart
-        self._made_with = {"apart": self.apart, **made_with(products.of(self.config.hyper))}
+        self._made_with = {"apart": tasks.apart, **made_with(products.of(self.config.hyper))}
         self.notes += tasks.notes
         kind = OnPolicyLoop if isinstance(self.config.hyper, OnPolicy) else Members
-        self.loop: Loop = kind(self.config, tasks.envs)
+        try:
+            self.loop: Loop = kind(self.config, tasks.envs)
+        except BaseException:
+            close_all(tasks.envs)
+            raise
         self._evaluator = Evaluator(self.loop, self.config, self.directory, tasks.recipe)
         self._reporter = Reporter(self.loop, self.config, self.directory, self._evaluator)
         self._stopping = self._closed = False
+
+    @contextmanager
+    def _closed_by_a_fault(self) -> Generator[None]:
+        """Close envs, threads and files if the block raises, whose error is the one to be seen."""
+        try:
+            yield
+        except BaseException:
+            with suppress(TaskError):
+                self.close()
+            raise
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""

@@ -9,11 +9,11 @@ import tempfile
 import time
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
+from pacesetter.extras import need
 from pacesetter.files import make_folder
 from pacesetter.process import CODES, cores
 from pacesetter.runs.lock import Lock
@@ -55,15 +55,7 @@ class Ray:
     """Tasks of a Ray cluster; each only runs a command, in this folder, which all nodes share."""
 
     def __init__(self, slots: int | None, address: str | None) -> None:
-        try:
-            ray: Any = import_module(
-                "ray"
-            )  # an extra that may be absent, also where types are checked
-        except ImportError:
-            raise UsageError(
-                "executor: ray is not installed; pip install 'pacesetter[scale]'"
-            ) from None
-        self._ray = ray
+        self._ray = ray = need("executor", "ray", "pacesetter[scale]")
         try:
             ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         except (ConnectionError, ValueError, RuntimeError) as error:

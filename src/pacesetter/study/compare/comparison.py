@@ -1,4 +1,4 @@
-"""Gathering runs for a comparison: which may be compared, and what a reader must be told."""
+"""A comparison of runs: which may be compared, and what a reader must be told."""
 
 import re
 from collections import defaultdict

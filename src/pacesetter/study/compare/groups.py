@@ -113,6 +113,11 @@ class Comparison:
     def find(self, env: str, name: str) -> Group | None:
         return next((g for g in self.groups if (g.env, g.name) == (env, name)), None)
 
+    def control(self, group: Group) -> Group | None:
+        """The control on a group's task; None where there is none, and for the control itself."""
+        found = self.find(group.env, self.reference)
+        return None if found is group else found
+
 
 def split(env: str) -> tuple[str, str]:
     """A task without its version, and the version; the Ant with 111 observations is an Ant."""

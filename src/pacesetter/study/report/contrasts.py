@@ -16,8 +16,8 @@ def against(comparison: Comparison) -> list[Table]:
     """Each algorithm less the control on the same task: gap, chance to be better, seeds needed."""
     metric, rows = comparison.metric, list[list[Cell]]()
     for group in comparison.groups:
-        control = comparison.find(group.env, comparison.reference)
-        if control is None or control is group:
+        control = comparison.control(group)
+        if control is None:
             continue
         x, y = group.values(metric), control.values(metric)
         gap, deviations = stats.difference(x, y), (stats.deviation(x), stats.deviation(y))

@@ -59,8 +59,8 @@ def _metric(group: Group, metric: str) -> dict[str, Any]:
 
 def _difference(comparison: Comparison, group: Group) -> dict[str, Any] | None:
     """Against the control on the same task; None for the control and where there is none."""
-    control = comparison.find(group.env, comparison.reference)
-    if control is None or control is group:
+    control = comparison.control(group)
+    if control is None:
         return None
     x, y = group.values(comparison.metric), control.values(comparison.metric)
     return stats.difference(x, y)._asdict() | {"p_better": stats.improvement([(x, y)]).value}

@@ -15,12 +15,12 @@ from pacesetter.study.compare.results import AXES
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
 from pacesetter.study.report.contents import NAMES, title
 from pacesetter.study.report.curves import Curve, curve, profiles, style
-from pacesetter.study.report.paper import TASKS
+from pacesetter.study.report.paper import PAPER, TASKS
 from pacesetter.study.report.tables import steps
 
 COLUMNS = 3
 BAND = "95% t interval (cut where far wider)"
-FIGURE_2 = (("multi-td3", "sunrise"), ("multi-td3", "td3"))
+FIGURE_2 = tuple(PAPER.values())
 Styles = Mapping[str, tuple[str, str]]
 
 

@@ -38,7 +38,7 @@ def _film(run: Run, allow: Collection[str]) -> Film:
     from pacesetter.policy import load
 
     try:
-        policy = load(run.folder / "policy.safetensors")
+        policy = load(run.folder)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
             env = recipe_of(policy.about, None, allow=allow)

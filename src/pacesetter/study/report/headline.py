@@ -78,8 +78,7 @@ def _tally(comparison: Comparison) -> str:
     """On how many tasks each algorithm is ahead of the control; empty without a control."""
     counts: dict[str, list[int]] = {}
     for group in comparison.groups:
-        control = comparison.find(group.env, comparison.reference)
-        if control is not None and control is not group:
+        if control := comparison.control(group):
             x, y = group.values(comparison.metric), control.values(comparison.metric)
             low, high = stats.difference(x, y)[1:]
             place = 3 if np.isnan(low) else 0 if low > 0 else 1 if high < 0 else 2

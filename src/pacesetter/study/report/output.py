@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from pacesetter.errors import UsageError
+from pacesetter.errors import UsageError, writing
 from pacesetter.files import replacing, write_atomically
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
@@ -63,7 +63,7 @@ def notebook(comparison: Comparison) -> str:
 
 def write(comparison: Comparison, path: Path, options: Options) -> None:
     """One file; UsageError where it cannot be written."""
-    try:
+    with writing("-o", path):
         if path.suffix in DRAWN:
             from pacesetter.study.report import figures
 
@@ -72,8 +72,6 @@ def write(comparison: Comparison, path: Path, options: Options) -> None:
                 draw(comparison, file, options.smooth)
         else:
             write_atomically(path, _page(comparison, path.suffix, options).encode())
-    except OSError as error:
-        raise UsageError(f"-o: cannot write {path}: {error.strerror}") from None
 
 
 def _page(comparison: Comparison, suffix: str, options: Options) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pacesetter import algorithms
 from pacesetter.config import resolve
-from pacesetter.errors import TrainingError, UsageError
+from pacesetter.errors import TrainingError, UsageError, tell, writing
 from pacesetter.files import make_folder, present, sync_folder, write_atomically
 from pacesetter.runs import WITHOUT_RESULT, Row, RunDirectory, find_all
 from pacesetter.runs.lock import Lock, alone
@@ -65,15 +65,13 @@ class Tuning:
         self._stopping = False
         settings = {k: v for k, v in self.config.settings().items() if k not in ("name", "seed")}
         run = self.config.run
-        try:
+        with writing("study", self.file):
             for folder in (*reversed(self.runs.parents), self.runs):
                 make_folder(folder)
             with alone(self._lock):
                 patience = run.steps // run.eval_every // 3
                 self.study = open_study(self.file, journal, settings, self.ranges, patience)
             sync_folder(self.file.parent)
-        except OSError as error:
-            raise UsageError(f"study: cannot write {self.file}: {error.strerror}") from None
 
     def _refuse_bad_input(self) -> None:
         """Before anything is written."""
@@ -210,7 +208,7 @@ class Tuning:
         except UsageError as error:  # damaged, which is no reason to stop the study
             raise TrainingError(str(error)) from None
         for note in trainer.notes:
-            print(f"pacesetter: {note}", file=sys.stderr)
+            tell(note)
         return trainer
 
     def _tell(self, trial: optuna.Trial, state: Any, value: float | None, text: str) -> None:
