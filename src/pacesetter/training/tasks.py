@@ -1,10 +1,10 @@
 """The envs that a run trains in, and how it keeps their episodes apart."""
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pacesetter.config import Config
 from pacesetter.envs import Environment, apart
@@ -24,11 +24,16 @@ class Tasks(NamedTuple):
     notes: list[str]
 
 
-def close_all(envs: Iterable[Environment]) -> None:
-    """Close envs after a fault, whose error is the one to be seen."""
-    for env in envs:
-        with suppress(TaskError):
-            env.close()
+@contextmanager
+def closed_by_a_fault(things: Iterable[Any]) -> Generator[None]:
+    """Close all things if the block raises, whose error is the one to be seen."""
+    try:
+        yield
+    except BaseException:
+        for each in things:
+            with suppress(TaskError):
+                each.close()
+        raise
 
 
 def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) -> Tasks:
@@ -44,12 +49,9 @@ def make_tasks(config: Config, before: Apart | None, env: str | Factory | None) 
     count = hyper.parallel_envs if on_policy else run.members * hyper.num_envs
     world = partial(Environment, recipe, run.seed, Stream.TRAIN, ranges=run.randomize)
     envs: list[Environment] = []
-    try:
+    with closed_by_a_fault(envs):
         envs.extend(world(index=index) for index in range(count))
         cast = envs[0].check()
-    except BaseException:
-        close_all(envs)
-        raise
     notes = [] if before else cast
     if isinstance(env, str) and env != run.env:
         notes.insert(0, f"env: '{env}' has no version; taking the newest, {run.env}")

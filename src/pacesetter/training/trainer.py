@@ -1,8 +1,8 @@
 """A run from first to last step: an iterator of reports that can stop and go on anywhere."""
 
 import sys
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, Unpack, overload
 
@@ -27,7 +27,7 @@ from pacesetter.training.on_policy import OnPolicyLoop
 from pacesetter.training.report import Report
 from pacesetter.training.reporter import Reporter
 from pacesetter.training.starting import start_from
-from pacesetter.training.tasks import close_all, make_tasks
+from pacesetter.training.tasks import closed_by_a_fault, make_tasks
 
 if TYPE_CHECKING:
     from pacesetter.settings.typed import Name, TrainerSettings
@@ -67,7 +67,7 @@ class Trainer:
         self.directory.refuse_existing(self.config)
         self.notes = prepare(self.config.run.device)
         self._begin(None, env)
-        with self._closed_by_a_fault():
+        with closed_by_a_fault([self]):
             start_from(self.loop, self.config, runs)
             self.directory.create(self.config, **self._made_with)
             try:
@@ -115,7 +115,7 @@ class Trainer:
         identity.refuse_other_settings(self.config, self.directory)
         self.notes = prepare(self.config.run.device)
         self._begin(apart.recorded(self.directory.record()), env)
-        with self._closed_by_a_fault():
+        with closed_by_a_fault([self]):
             self.directory.lock()
             self.directory.sweep()
             self.loop.open_replays(self.directory.state_file.parent)
@@ -141,24 +141,11 @@ class Trainer:
         self._made_with = {"apart": tasks.apart, **made_with(products.of(self.config.hyper))}
         self.notes += tasks.notes
         kind = OnPolicyLoop if isinstance(self.config.hyper, OnPolicy) else Members
-        try:
+        with closed_by_a_fault(tasks.envs):
             self.loop: Loop = kind(self.config, tasks.envs)
-        except BaseException:
-            close_all(tasks.envs)
-            raise
         self._evaluator = Evaluator(self.loop, self.config, self.directory, tasks.recipe)
         self._reporter = Reporter(self.loop, self.config, self.directory, self._evaluator)
         self._stopping = self._closed = False
-
-    @contextmanager
-    def _closed_by_a_fault(self) -> Generator[None]:
-        """Close envs, threads and files if the block raises, whose error is the one to be seen."""
-        try:
-            yield
-        except BaseException:
-            with suppress(TaskError):
-                self.close()
-            raise
 
     def __iter__(self) -> Iterator[Report]:
         """Train until the budget is spent, `stop` is called or the caller breaks; then save."""
