@@ -1,4 +1,4 @@
-"""One env: its episode, the noise of whoever explores it, and the policy that a run keeps of it."""
+"""One env: its episode, the noise of whoever explores it, and the policies that fit it."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any
