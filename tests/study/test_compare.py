@@ -25,7 +25,7 @@ from pacesetter.study.compare import lineage, stats
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.gathering import gather
 from pacesetter.study.compare.groups import Comparison, split
-from pacesetter.study.compare.results import compact
+from pacesetter.study.compare.results import AXES, compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
 from pacesetter.training.trainer import Trainer
@@ -704,6 +704,14 @@ def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> No
     assert rows[0] == rows[1]
 
 
+def test_a_picture_is_drawn_against_the_axis_asked_for(runs: Path, command: Any) -> None:
+    """A .svg names its axis; without the flag that is env steps."""
+    for words, said in (([], AXES["steps"]), (["--axis", "cpu"], AXES["cpu"])):
+        assert command(runs, "-o", "a.svg", *words)[0] == 0
+        texts = re.findall("<!-- (.*) -->", Path("a.svg").read_text())
+        assert [axis for axis in AXES.values() if axis in texts] == [said]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -712,6 +720,8 @@ def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> No
         (["-o", "a.doc"], "-o: a.doc must end in .html"),
         (["-o", "none/a.md"], "-o: none is not a folder"),
         (["--smooth", "4"], "smooth: must be an odd number"),
+        (["--axis", "time", "-o", "a.png"], "axis: unknown 'time'; allowed: cpu, steps"),
+        (["--axis", "cpu", "-o", "a.html"], "axis: it is for the curves of a .png or .svg"),
         (["--budget", "1M"], "none is complete"),
     ],
 )

@@ -10,7 +10,9 @@ def compare(words: list[str]) -> int:
     from pacesetter.study.compare.comparison import compare
     from pacesetter.study.report import output
 
-    options = output.Options(found.published, found.smooth, not found.no_film, tuple(found.allow))
+    options = output.Options(
+        found.published, found.smooth, found.axis, not found.no_film, tuple(found.allow)
+    )
     paths = output.check(found.o, options)
     comparison = compare(
         found.run,
@@ -47,6 +49,8 @@ def _parser() -> Parser:
     add("--mixed", action="store_true", help=mixed)
     smooth = "smooth curves over N evaluations, an odd number of at least 5 (default no smoothing)"
     add("--smooth", type=int, metavar="N", help=smooth)
+    axis = "draw the curves of a .png or .svg against steps, updates, cpu or wall (default steps)"
+    add("--axis", metavar="X", help=axis)
     add("--no-film", action="store_true", help="leave the video out of the report")
     output = (
         "write a .html report, .md or .tex tables, .csv or .json numbers, or .png, .svg or .pdf "

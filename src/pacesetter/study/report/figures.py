@@ -38,7 +38,9 @@ def pdf(comparison: Comparison, path: Path, window: int | None = None) -> None:
                 file.savefig(figure)
 
 
-def picture(comparison: Comparison, path: Path, window: int | None = None) -> None:
+def picture(
+    comparison: Comparison, path: Path, window: int | None = None, axis: str = "steps"
+) -> None:
     """One PNG or SVG: each task's curves, and its intervals below or, for one task, beside them."""
     import matplotlib
 
@@ -52,7 +54,7 @@ def picture(comparison: Comparison, path: Path, window: int | None = None) -> No
         row, column = 2 * (place // columns), place % columns
         above = panels[row, column]
         below = panels[row + 1, column] if len(envs) > 1 else panels[0, 1]
-        _curves(above, comparison, env, "steps", window)
+        _curves(above, comparison, env, axis, window)
         above.get_legend().remove()  # the intervals name the colours
         _intervals(below, comparison, env)
         above.set_visible(True)

@@ -4,25 +4,30 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from pacesetter.errors import UsageError, writing
+from pacesetter.errors import UsageError, unknown, writing
 from pacesetter.files import replacing, write_atomically
 from pacesetter.study.compare.groups import Comparison
+from pacesetter.study.compare.results import AXES
 from pacesetter.study.compare.stats import SMOOTHING_ORDER
 from pacesetter.study.report import contents, contrasts, data, paper, tables
 from pacesetter.study.report.headline import headline
 from pacesetter.study.report.tables import Table
 from pacesetter.text import printable
 
-DRAWN = (".pdf", ".png", ".svg")
-SUFFIXES = (".html", ".md", ".tex", ".csv", ".json", *DRAWN)
+PICTURES = (".png", ".svg")
+SUFFIXES = (".html", ".md", ".tex", ".csv", ".json", ".pdf", *PICTURES)
 
 
 @dataclass(frozen=True)
 class Options:
-    """What may be chosen of the output; `smooth` is a window of evaluations, for curves only."""
+    """What may be chosen of the output.
+
+    `smooth` is a window of evaluations, for curves only; `axis` what a picture draws them against.
+    """
 
     published: bool = False
     smooth: int | None = None
+    axis: str | None = None
     film: bool = True
     allow: tuple[str, ...] = ()  # names of tasks that may import a module, to be filmed
 
@@ -41,7 +46,19 @@ def check(paths: list[str], options: Options) -> list[Path]:
             f"smooth: must be an odd number of evaluations above {SMOOTHING_ORDER}, "
             f"got {options.smooth}"
         )
+    if options.axis is not None:
+        _check_axis(options.axis, [Path(path).suffix for path in paths])
     return [Path(path) for path in paths]
+
+
+def _check_axis(axis: str, suffixes: list[str]) -> None:
+    if axis not in AXES:
+        raise unknown("axis", axis, AXES)
+    if not set(PICTURES).intersection(suffixes):
+        raise UsageError(
+            "axis: it is for the curves of a .png or .svg; give -o with one"
+            " (a .html or .pdf has every axis)"
+        )
 
 
 def text(comparison: Comparison, options: Options) -> str:
@@ -64,12 +81,14 @@ def notebook(comparison: Comparison) -> str:
 def write(comparison: Comparison, path: Path, options: Options) -> None:
     """One file; UsageError where it cannot be written."""
     with writing("-o", path):
-        if path.suffix in DRAWN:
+        if path.suffix in (".pdf", *PICTURES):
             from pacesetter.study.report import figures
 
-            draw = figures.pdf if path.suffix == ".pdf" else figures.picture
             with replacing(path) as file:
-                draw(comparison, file, options.smooth)
+                if path.suffix == ".pdf":
+                    figures.pdf(comparison, file, options.smooth)
+                else:
+                    figures.picture(comparison, file, options.smooth, options.axis or "steps")
         else:
             write_atomically(path, _page(comparison, path.suffix, options).encode())
 
