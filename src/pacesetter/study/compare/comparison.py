@@ -171,6 +171,11 @@ def _in_force(settings: Row, key: str) -> Any:
 
 def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
     """Notes on what is no reason to refuse."""
+    return [*_thin(groups, runs), *_counted_apart(runs, limit), *_made_apart(runs)]
+
+
+def _thin(groups: list[Group], runs: list[Run]) -> list[str]:
+    """Notes on groups and runs that say little."""
     notes: list[str] = []
     few = [group for group in groups if len(group.runs) < stats.FEWEST_SEEDS]
     if few:
@@ -189,19 +194,29 @@ def _remarks(groups: list[Group], runs: list[Run], limit: Limit) -> list[str]:
             f"Fewer than {stats.FEWEST_EVALUATIONS} evaluations after the first update, so the "
             f"last one counts alone: {names}. A smaller --eval-every gives more."
         )
-    if limit.budget or limit.cpu:
-        notes.append(f"Every run counts up to {limit}.")
+    return notes
+
+
+def _counted_apart(runs: list[Run], limit: Limit) -> list[str]:
+    """Notes on what counts in one run and not in another."""
+    limited = limit.budget or limit.cpu
+    notes = [f"Every run counts up to {limit}."] if limited else []
     if any(run.settings.get("count_selection_steps") is False for run in runs):
         notes.append("Steps of selection come on top of the env steps where a run left them out.")
     for key, what in (("eval_every", "evaluations come at"), ("eval_episodes", "episodes differ")):
         if len({run.settings.get(key) for run in runs}) > 1:
             notes.append(f"Settings of the evaluation differ ({key}): {what} other numbers.")
+    return notes + (_unfinished_schedules(runs) if limited else [])
+
+
+def _made_apart(runs: list[Run]) -> list[str]:
+    """Notes on machines and versions that differ."""
+    notes: list[str] = []
     makers = [made for run in runs for made in run.makers]
     for key, what in MACHINES.items():
         # What an older version did not record is not a difference.
         if len({str(made[key]) for made in makers if _is_told(made, key)}) > 1:
             notes.append(f"The runs had several {what}: compare no CPU or wall seconds.")
-    notes += _unfinished_schedules(runs) if limit.budget or limit.cpu else []
     commits = {str(made["commit"]) for made in makers}
     if len(commits) > 1:
         notes.append(f"The runs come from {len(commits)} commits; the last table lists them.")
