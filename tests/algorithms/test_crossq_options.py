@@ -246,10 +246,10 @@ def test_bins_in_a_run_are_off_unless_asked_for(runs: Path) -> None:
     settings: dict[str, Any] = {**TINY, "steps": 300, "critic_hidden": (8,), "hidden": (8,)}
     trainer = Trainer("crossq", "Pendulum-v1", runs=runs, bins=11, name="bins", **settings)
     run_to_end(trainer)
-    assert trainer.loop.experience.returns.sums[0] == 300
-    assert trainer.loop.experience.returns.deviation > 1
+    assert trainer.loop.experience.return_scale.sums[0] == 300
+    assert trainer.loop.experience.return_scale.deviation > 1
     plain = Trainer("crossq", "Pendulum-v1", runs=runs, **settings)
-    assert plain.loop.experience.returns is None
+    assert plain.loop.experience.return_scale is None
     assert "returns" not in plain.loop.parts()
     plain.close()
 

@@ -246,7 +246,7 @@ def test_a_new_episode_has_nothing_of_the_one_that_does_not_repeat(runs: Any) ->
     resumed = Trainer.resume(trainer.directory.path)
     assert resumed.loop.explorers[0].pending is None
     resumed.loop.tick()
-    explorer, returns = resumed.loop.explorers[0], resumed.loop.experience.returns
+    explorer, returns = resumed.loop.explorers[0], resumed.loop.experience.return_scale
     resumed.close()
     assert len(explorer.env.actions) == 1
     assert returns.running[0] == explorer.env.earned

@@ -54,9 +54,9 @@ def test_a_run_keeps_the_deviation_and_evaluates_plain_rewards(runs: Path) -> No
     settings: dict[str, Any] = {**TINY, "steps": 300, "runs": runs}
     scaled = Trainer("td3", "Pendulum-v1", name="scaled", normalize_reward=True, **settings)
     reports = [report for report in scaled if report.kind == "eval"]
-    assert scaled.loop.experience.returns.sums[0] == 300
-    assert scaled.loop.experience.returns.deviation > 1
+    assert scaled.loop.experience.return_scale.sums[0] == 300
+    assert scaled.loop.experience.return_scale.deviation > 1
     plain = Trainer("td3", "Pendulum-v1", **settings)
-    assert plain.loop.experience.returns is None
+    assert plain.loop.experience.return_scale is None
     (first, *_) = [report for report in plain if report.kind == "eval"]
     assert first.values["returns"] == reports[0].values["returns"]  # both untrained

@@ -289,7 +289,7 @@ def test_the_scale_of_rewards_goes_with_the_critics(runs: Path) -> None:
     new = Trainer(
         "td3", ENV, runs=runs, name="new", start_from=source, **SHORT, normalize_reward=True
     )
-    before, now = old.loop.experience.returns, new.loop.experience.returns
+    before, now = old.loop.experience.return_scale, new.loop.experience.return_scale
     assert now.deviation == before.deviation != 1
     assert not now.running.any()
     new.close()

@@ -20,7 +20,7 @@ class Experience:
         run, hyper = config.run, config.hyper
         self.config, self.layout, self.members = config, layout, run.members
         self.normalizer = Normalizer(spec.observation_size, hyper.normalize_observation)
-        self.returns = ReturnScale(hyper.gamma, envs) if hyper.scales_rewards else None
+        self.return_scale = ReturnScale(hyper.gamma, envs) if hyper.scales_rewards else None
         self.queues = [NStepQueue(hyper.n_step) for _ in range(envs)]
         self.replays: list[Replay] = []
 
@@ -40,8 +40,8 @@ class Experience:
         for transition in self.queues[i].flush():
             replay.add(transition, i)
         replay.sampler.end(i, None)
-        if self.returns:
-            self.returns.running[i] = 0.0
+        if self.return_scale:
+            self.return_scale.running[i] = 0.0
 
     def add(self, i: int, transition: Transition) -> None:
         """Env i made a step."""
@@ -49,8 +49,8 @@ class Experience:
         for complete in self.queues[i].push(transition):
             replay.add(complete, i)
         self.normalizer.add(transition.observation)
-        if self.returns:
-            self.returns.add(i, transition.reward, transition.last)
+        if self.return_scale:
+            self.return_scale.add(i, transition.reward, transition.last)
 
     def end_episode(self, i: int, total: float) -> None:
         """Env i ended an episode with this return."""
@@ -65,7 +65,7 @@ class Experience:
         """What a checkpoint holds of it."""
         return {
             "normalizer": self.normalizer,
-            **({"returns": self.returns} if self.returns else {}),
+            **({"returns": self.return_scale} if self.return_scale else {}),
             **numbered("queue", self.queues),
             **numbered("replay", self.replays),
         }

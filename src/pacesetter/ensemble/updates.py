@@ -34,8 +34,8 @@ class Updates:
     def make(self, members: Sequence[int]) -> None:
         """One call of the update of each of these members, all at the same time."""
         samples = [self._sample(k) for k in members]
-        statistics, returns = self.experience.normalizer.statistics(), self.experience.returns
-        extra = {"return_deviation": returns.deviation} if returns else None
+        statistics, scale = self.experience.normalizer.statistics(), self.experience.return_scale
+        extra = {"return_deviation": scale.deviation} if scale else None
         inputs: list[UpdateInputs] = []
         for k, sample in zip(members, samples, strict=True):
             member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
