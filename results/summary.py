@@ -51,7 +51,8 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "walkers": [{"budget": "30k"}],
     "champions": [{"budget": "100k", "reference": "crossq-small"}],
     "humanoid": [{"budget": "776k", "reference": "multi-td3"}],
-    "ensemble": [{"reference": "single"}, {"reference": "single-200k"}, {"reference": "none"}],
+    "ensemble": [{"reference": "single-half"}, {"reference": "single"}, {"reference": "none"}],
+    "stage-2": [{"budget": "100k", "reference": "td7-small-bf16"}, {"budget": "300k"}],
     "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
 }
 
@@ -71,6 +72,8 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
             print(f"left out as unfinished: {each.path}", file=sys.stderr)
             continue
         others = [*apart(each, line)] if study in APART else []
+        if study == "ensemble":
+            others += [halved(one) for one in (line, *others) if _name(one).startswith("single")]
         for one in others:
             read(str(each.path), one)  # which refuses what compare could not read
         for one in [line, *others]:
@@ -96,9 +99,21 @@ def apart(run: RunDirectory, line: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 [*values[:place], list(each), *values[place + 1 :]]
                 for values, each in zip(line["evaluations"], returns, strict=True)
             ]
-            settings = line["settings"] | {"name": f"{line['settings']['name']}-{name}"}
+            settings = line["settings"] | {"name": f"{_name(line)}-{name}"}
             start = {"varied": line["varied"][:1]} if "varied" in line else {}
             yield line | {"settings": settings, "evaluations": changed, "selections": []} | start
+
+
+def halved(line: dict[str, Any]) -> dict[str, Any]:
+    """The line of a run as if it had ended at half of its steps."""
+    steps, place = line["settings"]["steps"] // 2, line["columns"].index("step")
+    settings = line["settings"] | {"name": f"{_name(line)}-half", "steps": steps}
+    kept = [values for values in line["evaluations"] if values[place] <= steps]
+    return line | {"settings": settings, "evaluations": kept}
+
+
+def _name(line: dict[str, Any]) -> str:
+    return line["settings"]["name"]
 
 
 def _key(line: dict[str, Any]) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from pacesetter.study.compare import lineage, stats
 from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.gathering import gather
 from pacesetter.study.compare.groups import Comparison, split
-from pacesetter.study.compare.results import AXES, compact
+from pacesetter.study.compare.results import AXES, Run, compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
 from pacesetter.study.report.published import sources
 from pacesetter.training.trainer import Trainer
@@ -896,6 +896,32 @@ def _lines(script: Path) -> list[str]:
     return script.with_name("pilot.jsonl").read_text().splitlines()
 
 
+def collected(tmp_path: Path, study: str) -> dict[str, Run]:
+    """The runs below `runs`, as `results/summary.py --collect` takes them in, by name."""
+    (tmp_path / "results").mkdir()
+    copy = tmp_path / "results" / "summary.py"
+    copy.write_text((ROOT / "results" / "summary.py").read_text())
+    command = [sys.executable, copy, "--study", study, "--collect", study, "runs"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = {run.name: run for run in gather([copy.with_name(f"{study}.jsonl")]).runs}
+    assert all(name in done.stdout for name in found)
+    return found
+
+
+def test_one_learner_is_read_at_half_of_its_steps_too(tmp_path: Path) -> None:
+    """Beside two members: for the updates of one, and for those of both."""
+    settings: dict[str, Any] = {**TINY, "steps": 200, "eval_every": 50, "mean_actions": "on"}
+    trainer = Trainer("td3", "Pendulum-v1", runs=tmp_path / "runs", name="single", **settings)
+    run_to_end(trainer)
+    found = collected(tmp_path, "ensemble")
+    assert found.keys() == {"single", "single-ema", "single-half", "single-ema-half"}
+    assert found["single-half"].finished
+    for name in ("single", "single-ema"):
+        whole, half = found[name], found[f"{name}-half"]
+        assert (half.steps[-1], whole.steps[-1]) == (100, 200)
+        np.testing.assert_array_equal(half.returns, whole.returns[:3])
+
+
 def test_other_policies_of_a_run_are_collected_as_groups(tmp_path: Path) -> None:
     """Of a study of ensembles: members alone, their mean action and that of their EMA actors."""
     settings: dict[str, Any] = {**TINY, "steps": 200, "eval_every": 100, "members": 2}
@@ -904,14 +930,7 @@ def test_other_policies_of_a_run_are_collected_as_groups(tmp_path: Path) -> None
     run_to_end(trainer)
     rows = trainer.directory.rows("eval")
     assert all(row["members"][row["champion"]] == row["mean"] for row in rows)
-    (tmp_path / "results").mkdir()
-    copy = tmp_path / "results" / "summary.py"
-    copy.write_text((ROOT / "results" / "summary.py").read_text())
-    command = [sys.executable, copy, "--study", "ensemble", "--collect", "ensemble", "runs"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "none-ema" in done.stdout
-    runs = gather([copy.with_name("ensemble.jsonl")]).runs
-    found = {run.name: run.returns for run in runs}
+    found = {name: run.returns for name, run in collected(tmp_path, "ensemble").items()}
     assert found.keys() == {"none", "none-members", "none-mean", "none-ema"}
     for name, means in {
         "none-members": [np.mean(row["members"]) for row in rows],
