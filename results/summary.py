@@ -26,7 +26,8 @@ from pacesetter.study.report.figures import pdf
 from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
-LEVELS = (2_000, 5_000, 8_000)  # returns of the frontier
+LEVELS = (2_000, 5_000, 8_000)  # returns whose cost is shown
+LEVELLED = ("frontier", "peers", "stage-2")  # for these studies
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
     "paper": [{"budget": "1M"}, {"budget": "2M", "reference": "multi-td3"}],
@@ -52,6 +53,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "champions": [{"budget": "100k", "reference": "crossq-small"}],
     "humanoid": [{"budget": "776k", "reference": "multi-td3"}],
     "ensemble": [{"reference": "single-half"}, {"reference": "single"}, {"reference": "none"}],
+    "peers": [{"budget": "100k", "reference": "sb3-td3"}],
     "stage-2": [{"budget": "100k", "reference": "td7-small-bf16"}, {"budget": "300k"}],
     "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
 }
@@ -129,7 +131,7 @@ def shown(study: str, limit: dict[str, str]) -> str:
     if study == "ensemble":
         found += contrasts.together(there)
     found += [*contrasts.best_of_two(there), contents.ledger(there.groups)]
-    if study == "frontier":
+    if study in LEVELLED:
         found.append(levels(there))
     if study == "trust-region" and (beside := paper.published(there)) is not None:
         found.append(beside)
