@@ -1,9 +1,10 @@
-"""A balloon that holds its place above a station while it saves power.
+r"""A balloon that holds its place above a station while it saves power.
 
 It cannot steer: the wind carries it, and only its altitude chooses which wind. Climbing and sinking
 cost power, drifting is free. The winds differ from episode to episode.
 
-    PYTHONPATH=examples pacesetter train td3 balloon:Balloon-v0 --steps 20k --warmup 2k
+    PYTHONPATH=examples pacesetter train td3 balloon:Balloon-v0 --steps 20k --warmup 2k \
+        --hidden 64 64
     python examples/balloon.py runs/balloon-Balloon-v0/td3/0/policy.safetensors
 """
 

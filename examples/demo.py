@@ -21,7 +21,8 @@ from pacesetter.runs import RunDirectory
 # Without such instructions products of bfloat16 are slower than those of float32.
 ALGORITHM = "quick" if multiplies_bfloat16() else "crossq-small"
 ENV, RUNS = "HalfCheetah-v5", Path("runs")
-RUN = RUNS / ENV / ALGORITHM / "0"
+NAME = "demo"  # so that no later `pacesetter train` finds its folder taken
+RUN = RUNS / ENV / NAME / "0"
 EPISODES, SEED = 10, 1
 
 
@@ -51,7 +52,7 @@ def open_run() -> Trainer:
     """A new run, or the one that an earlier call began."""
     if not RunDirectory(RUN).config_file.exists():
         say(f"training into {RUN} for at most 5 minutes; Ctrl-C saves, and a new call goes on")
-        return Trainer(ALGORITHM, ENV, runs=RUNS, steps=150_000, time="5m")
+        return Trainer(ALGORITHM, ENV, name=NAME, runs=RUNS, steps=150_000, time="5m")
     trainer = Trainer.resume(RUN, runs=RUNS)
     for note in trainer.notes:
         say(note)
