@@ -1,9 +1,10 @@
 PYTHON ?= python3
 BIN := .venv/bin
+BUILT := hatch_build.py $(wildcard src/pacesetter/learner/*.cc src/pacesetter/learner/*.h)
 
 .PHONY: demo test test-slow torture torture-long check docs wheel bench-speed clean
 
-.venv/installed: pyproject.toml
+.venv/installed: pyproject.toml $(BUILT)
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	touch $@

@@ -87,10 +87,10 @@ def alone(product: Product, rng: np.random.Generator) -> Callable[[], Any]:
 
 
 def whole(
-    name: str, spec: Spec, members: int, **settings: Any
+    name: str, spec: Spec, members: int, env: str = "HalfCheetah-v5", **settings: Any
 ) -> tuple[Callable[[], Any], Counter[Product], int]:
     """A cycle of every member as training calls it, its products, and its updates."""
-    config = resolve(name, "HalfCheetah-v5", settings)
+    config = resolve(name, env, settings)
     algorithm = algorithms.find(config.run.algorithm).build(spec, config.hyper)
     layout = Layout(spec, len(algorithm.mask(np.random.default_rng(0))))
     hyper = config.hyper
@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--members", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=15)
     chosen = parser.parse_args()
-    cycle, counts, updates = whole(chosen.algorithm, SPECS[chosen.env], chosen.members)
+    cycle, counts, updates = whole(chosen.algorithm, SPECS[chosen.env], chosen.members, chosen.env)
     rng = np.random.default_rng(0)
     calls = {product: quicker(product, rng) for product in counts}
     timed(cycle, 3)

@@ -1,7 +1,8 @@
 """Seconds that `pacesetter compare` takes for many runs, which this makes up in a temporary folder.
 
 Each made-up run has the rows of a real one of a million steps: an evaluation every 5,000, a row of
-training every 1,000 and a selection every 2,000 in ensembles. CPU seconds count on a busy machine.
+training every 1,000 and two selections every 5,000 in ensembles. CPU seconds count on a busy
+machine. Tests make their runs with `make_run` too.
 
 python benchmarks/compare.py
 """

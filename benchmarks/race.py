@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any, NamedTuple
 
-from speed import OUR_RATES, OURS, START, rate, time_peer
+from speed import OUR_RATES, OURS, START, rate, time_peer, timed_steps
 from tabulate import tabulate
 
 ENV = "HalfCheetah-v5"
@@ -174,7 +174,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--who", nargs="+", help="of the entries, these libraries only")
     parser.add_argument("--what", nargs="+", choices=LEARNERS, help="these learners only")
-    parser.add_argument("--steps", type=int, default=2_000, help="timed steps, in thousands")
+    parser.add_argument("--steps", type=timed_steps, default=2_000, help="timed steps")
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -17,6 +17,7 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
+from speed import timed_steps
 from tabulate import tabulate
 
 Settings = dict[str, Any]
@@ -114,7 +115,7 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=1_000_000, help="rows in the replay")
     parser.add_argument("--repeats", type=int, default=1_000, help="cycles drawn alone")
     parser.add_argument("--env", default="HalfCheetah-v5")
-    parser.add_argument("--steps", type=int, default=3_000, help="timed steps, in thousands")
+    parser.add_argument("--steps", type=timed_steps, default=3_000, help="timed steps")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each kind; 0 for none")
     parser.add_argument("--measure", nargs=4, help=argparse.SUPPRESS)
     chosen = parser.parse_args()

@@ -55,10 +55,14 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "ensemble": [{"reference": "single-half"}, {"reference": "single"}, {"reference": "none"}],
     "peers": [{"budget": "100k", "reference": "sb3-td3"}],
     "stage-2": [{"budget": "100k", "reference": "td7-small-bf16"}, {"budget": "300k"}],
+    "rescue": [{"reference": "single"}],
+    "cores": [{"reference": "single"}, {"reference": "none-4"}],
     "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
+    "vary-alpha": [{"reference": "alpha-3e-4"}, {"reference": "vary-none"}],
 }
 
-APART = ("ensemble", "vary")  # studies of which every policy that was evaluated counts apart
+# Studies of which every policy that was evaluated counts apart.
+APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha")
 
 
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:

@@ -7,8 +7,12 @@ import jax
 import numpy as np
 import pytest
 from broken_envs import Late
+from policies import untrained
 
+from pacesetter.errors import UsageError
 from pacesetter.learner.backend import prepare
+from pacesetter.media.record import record
+from pacesetter.media.scene import INSTALL
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -21,6 +25,17 @@ def _keep_compiled() -> None:
 def runs(tmp_path: Path) -> Path:
     """Where a test's runs lie."""
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def gl(tmp_path: Path) -> None:
+    """Skip where this machine cannot draw; MuJoCo needs OpenGL, which pip does not install."""
+    try:
+        record(untrained("HalfCheetah-v5"), tmp_path / "probe.gif", frames=1, size=(32, 32))
+    except UsageError as error:
+        if INSTALL not in str(error):
+            raise
+        pytest.skip(str(error))
 
 
 @pytest.fixture

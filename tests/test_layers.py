@@ -1,4 +1,4 @@
-"""What a study is must not depend on how it is shown: arrows between folders go one way."""
+"""Nothing in the package depends on the command line, and no test on another."""
 
 import re
 from pathlib import Path

@@ -120,6 +120,8 @@ def recipe_of(
     Names of modules that the file gives must be among `allow`, or loaded. Raises UsageError.
     """
     if isinstance(env, Recipe):
+        if env_kwargs:
+            raise UsageError("env_kwargs: a Recipe has its own; give the keywords to it")
         return env
     name = full_id(env) if isinstance(env, str) else env or about.get("env")
     if name is not None and not isinstance(name, str):

@@ -8,17 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numeric import KEY, close, member, random_batch, random_state, same, slopes, squashed
+from numeric import KEY, SPEC, close, member, random_batch, random_state, same, slopes, squashed
 from short_runs import TINY, run_to_end
 
 from pacesetter.algorithms import crossq
-from pacesetter.batch import Spec
 from pacesetter.config import resolve
 from pacesetter.errors import UsageError
 from pacesetter.networks import batch_renorm, gaussian, mlp
 from pacesetter.training.trainer import Trainer
-
-SPEC = Spec(observation_size=3, action_size=2)
 
 
 def learner(**hyper: Any) -> crossq.CrossQ:

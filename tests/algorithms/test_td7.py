@@ -6,8 +6,18 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import KEY, close, member, random_batch
-from short_runs import TINY, assert_same, run_to_end
+from numeric import (
+    KEY,
+    SPEC,
+    close,
+    member,
+    near,
+    random_batch,
+    random_state,
+    same,
+    single,
+)
+from short_runs import TINY, assert_same, run_to_end, run_to_step
 
 from pacesetter.algorithms import td7
 from pacesetter.batch import Spec
@@ -17,7 +27,6 @@ from pacesetter.networks import sale
 from pacesetter.policy import Policy, load, unstack
 from pacesetter.training.trainer import Trainer
 
-SPEC = Spec(observation_size=3, action_size=2)
 SMALL: dict[str, Any] = {"hidden": (6, 5), "encoder_hidden": (7, 8), "encoder_size": 4}
 TRAINED = ("actor", "critic", "encoder")
 NETWORKS = (*TRAINED, "fixed_encoder", "target_actor", "target_critic", "target_encoder")
@@ -29,14 +38,7 @@ def learner(**hyper: Any) -> td7.TD7:
 
 def fresh(algorithm: td7.TD7, rng: np.random.Generator, **given: Any) -> Any:
     """A state in float64 whose networks are random, and so unlike their targets."""
-    state = jax.device_get(jax.jit(algorithm.init)(KEY))
-    state = jax.tree.map(lambda x: x.astype(float) if x.dtype.kind == "f" else x, state)
-
-    def draw(x: Any) -> Any:
-        return rng.normal(size=x.shape, scale=0.5)
-
-    drawn = {name: jax.tree.map(draw, getattr(state, name)) for name in NETWORKS}
-    return state._replace(**drawn, **given)
+    return random_state(algorithm, rng, *NETWORKS)._replace(**given)
 
 
 # A second TD7, with derivatives by hand.
@@ -296,41 +298,32 @@ def test_the_reference_has_the_right_derivatives(rng: np.random.Generator) -> No
 # What is copied when, and what no step moves.
 
 
-def equal(one: Any, other: Any) -> bool:
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return all(np.array_equal(a, b) for a, b in pairs)
-
-
-def floats(tree: Any) -> Any:
-    return jax.tree.map(lambda x: np.float32(x) if x.dtype.kind == "f" else x, tree)
-
-
 def test_targets_are_copied_every_250_updates(rng: np.random.Generator) -> None:
     """Not at the 248th; at the 250th, the target encoder from the fixed one of before."""
     algorithm = learner()
-    batch = floats(random_batch(rng, SPEC, 2, 8))
-    old = floats(fresh(algorithm, rng, updates=np.int32(246)))
+    batch = single(random_batch(rng, SPEC, 2, 8))
+    old = single(fresh(algorithm, rng, updates=np.int32(246)))
     step = jax.jit(algorithm.update)
     before = jax.device_get(step(old, batch, KEY).state)
     for name in ("fixed_encoder", "target_actor", "target_critic", "target_encoder", "value_range"):
-        assert equal(getattr(before, name), getattr(old, name))
+        assert same(getattr(before, name), getattr(old, name))
     after = jax.device_get(step(before, batch, KEY).state)
     for name in ("actor", "critic"):
-        assert equal(getattr(after, f"target_{name}"), getattr(after, name))
-        assert not equal(getattr(after, name), getattr(before, name))
-    assert equal(after.fixed_encoder, after.encoder)
-    assert equal(after.target_encoder, before.fixed_encoder)
-    assert equal(after.value_range, after.seen)
+        assert same(getattr(after, f"target_{name}"), getattr(after, name))
+        assert not same(getattr(after, name), getattr(before, name))
+    assert same(after.fixed_encoder, after.encoder)
+    assert same(after.target_encoder, before.fixed_encoder)
+    assert same(after.value_range, after.seen)
     assert after.seen[0] < after.seen[1]
 
 
 def test_next_values_stay_in_the_range_of_earlier_targets(rng: np.random.Generator) -> None:
     """Of huge values only the range's ends come through; before the first copy nothing does."""
     algorithm = learner()
-    state = floats(fresh(algorithm, rng))
+    state = single(fresh(algorithm, rng))
     *rest, last = state.target_critic
     state = state._replace(target_critic=(*rest, last | {"bias": last["bias"] + np.float32(1e6)}))
-    batch = floats(member(random_batch(rng, SPEC, 1, 16), 0))
+    batch = single(member(random_batch(rng, SPEC, 1, 16), 0))
     for low, high in ((0, 0), (-2, 3)):
         limited = state._replace(value_range=np.array([low, high], np.float32))
         y = jax.jit(algorithm.target)(limited, batch, KEY)
@@ -340,21 +333,21 @@ def test_next_values_stay_in_the_range_of_earlier_targets(rng: np.random.Generat
 def test_each_loss_moves_its_own_networks(rng: np.random.Generator) -> None:
     """The encoder learns from its loss alone; critics and actor leave what they see."""
     algorithm = learner()
-    old = floats(fresh(algorithm, rng))
-    batch = floats(member(random_batch(rng, SPEC, 1, 8), 0))
+    old = single(fresh(algorithm, rng))
+    batch = single(member(random_batch(rng, SPEC, 1, 8), 0))
     steps = {
         "encoder": jax.jit(algorithm.fit_encoder)(old, batch)[0],
         "critic": jax.jit(algorithm.fit_critic)(old, batch, batch.reward)[0],
         "actor": jax.jit(algorithm.fit_actor)(old, batch)[0],
     }
     for moved, new in steps.items():
-        changed = {n for n in NETWORKS if not equal(getattr(old, n), getattr(new, n))}
+        changed = {n for n in NETWORKS if not same(getattr(old, n), getattr(new, n))}
         assert changed == {moved}
 
 
 def test_learner_uses_no_key_twice(rng: np.random.Generator) -> None:
     algorithm = learner()
-    batch = floats(random_batch(rng, SPEC, 2, 7))
+    batch = single(random_batch(rng, SPEC, 2, 7))
     with jax.debug_key_reuse(True):
         state = jax.eval_shape(jax.jit(algorithm.init), KEY)
         jax.eval_shape(jax.jit(algorithm.update), state, batch, KEY)
@@ -376,23 +369,23 @@ def test_learners_begin_as_they_should() -> None:
         (state.encoder, state.fixed_encoder),
         (state.encoder, state.target_encoder),
     ):
-        assert equal(one, other)
+        assert same(one, other)
     np.testing.assert_array_equal(state.value_range, [0, 0])
 
 
 def test_copies_between_members(rng: np.random.Generator) -> None:
     """`weights` leaves a member its three Adams; an actor alone is refused in one line."""
     algorithm = learner()
-    own, parent = floats(fresh(algorithm, rng)), floats(fresh(algorithm, rng))
+    own, parent = single(fresh(algorithm, rng)), single(fresh(algorithm, rng))
     own = own._replace(updates=np.int32(5))
     parent = parent._replace(
         encoder_opt_state=jax.tree.map(lambda x: x + 1, parent.encoder_opt_state)
     )
     new = algorithm.copy_weights(own, parent)
     for name in (*NETWORKS, "seen", "value_range"):
-        assert equal(getattr(new, name), getattr(parent, name))
+        assert same(getattr(new, name), getattr(parent, name))
     for name in ("actor_opt_state", "critic_opt_state", "encoder_opt_state", "updates"):
-        assert equal(getattr(new, name), getattr(own, name))
+        assert same(getattr(new, name), getattr(own, name))
     with pytest.raises(UsageError, match="allowed: full, weights"):
         algorithm.copy_actor(own, parent)
 
@@ -403,7 +396,7 @@ def test_copies_between_members(rng: np.random.Generator) -> None:
 def test_policy_file_acts_as_the_learner(rng: np.random.Generator, tmp_path: Path) -> None:
     """NumPy, from the file, equals JAX with the fixed encoder; exploration adds its noise."""
     algorithm = learner()
-    state = floats(fresh(algorithm, rng))
+    state = single(fresh(algorithm, rng))
     observation = rng.normal(size=(50, 3)).astype(np.float32)
 
     def wanted(state: Any) -> Any:
@@ -419,7 +412,7 @@ def test_policy_file_acts_as_the_learner(rng: np.random.Generator, tmp_path: Pat
     noise = np.random.default_rng(1).standard_normal(2, np.float32)
     action, _ = algorithm.act(params, (), observation[0], np.random.default_rng(1))
     np.testing.assert_allclose(action, expected[0] + 0.1 * noise, atol=1e-5)
-    one = jax.jit(wanted)(state._replace(encoder=floats(fresh(algorithm, rng)).encoder))
+    one = jax.jit(wanted)(state._replace(encoder=single(fresh(algorithm, rng)).encoder))
     np.testing.assert_array_equal(one, expected)  # the encoder that learns has no say
 
 
@@ -428,7 +421,7 @@ def test_a_damaged_encoder_is_refused(name: str, rng: np.random.Generator, tmp_p
     """A stage of the wrong shape, or with a part missing, is one line."""
     algorithm = learner()
     layers, box = (
-        unstack(algorithm.policy(floats(fresh(algorithm, rng))).layers),
+        unstack(algorithm.policy(single(fresh(algorithm, rng))).layers),
         np.ones(2, np.float32),
     )
     first = layers[0][0]
@@ -452,16 +445,7 @@ def test_a_run_that_was_stopped_goes_on_exactly(runs: Path) -> None:
     directory = run_to_end(whole)
     assert [row for row in directory.rows() if row.get("assessed")]
     halves = Trainer("td7", "probe_envs:Scripted-v0", runs=runs, name="halves", **settings)
-    once = halves.loop.tick
-
-    def tick_and_stop() -> object:
-        selection = once()
-        if halves.progress.step >= 357:
-            halves.stop()
-        return selection
-
-    halves.loop.tick = tick_and_stop
-    run_to_end(halves)
+    run_to_step(halves, 357)
     assert not halves.finished
     assert_same(directory, run_to_end(Trainer.resume(halves.directory.path)))
 
@@ -507,10 +491,6 @@ def learned(env: str, runs: Path, **kwargs: Any) -> tuple[Trainer, Any]:
         return algorithm.values(state.critic, state.fixed_encoder, s, zs, a)
 
     return trainer, values
-
-
-def near(found: Any, expected: Any) -> None:
-    np.testing.assert_allclose(found, np.broadcast_to(expected, np.shape(found)), atol=0.1, rtol=0)
 
 
 def test_it_learns_the_action_that_fits_what_is_seen(runs: Path) -> None:

@@ -63,6 +63,14 @@ def test_a_run_of_days_is_said_once() -> None:
     assert "--critic-hidden 256 256" in line
 
 
+def test_updates_in_the_warmup_count() -> None:
+    """A run whose every step is one of the warm-up makes its updates all the same."""
+    steps: dict[str, Any] = {"steps": 1_000_000, "warmup": 1_000_000}
+    assert Clockwork("crossq", 2.0, **steps).lines(200) == []
+    (line,) = Clockwork("crossq", 2.0, **steps, warmup_updates=True).lines(200)
+    assert "about 5.8 days" in line
+
+
 def test_a_run_of_hours_is_not() -> None:
     assert Clockwork("crossq", 100.0).lines(200) == []
     assert Clockwork("crossq", 6.0).lines(200) != []

@@ -416,26 +416,28 @@ def whole(halfway: Path, tmp_path_factory: pytest.TempPathFactory) -> RunDirecto
     return run_to_end(Trainer("td3", PROBE, runs=tmp_path_factory.mktemp("whole"), **settings))
 
 
-def test_train_onto_a_run(run: RunDirectory, refused: Refused) -> None:
-    """The line says how to go on, and which setting differs if one does."""
-    config = run.path.parent / "same.toml"
+@pytest.fixture
+def same(run: RunDirectory) -> Path:
+    """The settings of that run in a file."""
     settings: dict[str, Any] = {**TINY, "steps": 700, "eval_every": 200}
     lines = [f"{k} = {list(v) if isinstance(v, tuple) else v}" for k, v in settings.items()]
+    config = run.path.parent / "same.toml"
     config.write_text("\n".join(lines))
-    again = ["train", "td3", PROBE, "--config", config]
+    return config
+
+
+def test_train_onto_a_run(run: RunDirectory, same: Path, refused: Refused) -> None:
+    """The line says how to go on, and which setting differs if one does."""
+    again = ["train", "td3", PROBE, "--config", same]
     says(refused(*again), [str(run.path.name), "exists", "pacesetter resume runs/"])
     line = refused(*again, "--gamma", "0.5")
     says(line, ["gamma=0.99", "0.5", "--name", "pacesetter resume runs/"])
     says(refused(*again, "--env.gain", "2"), ["env_kwargs", "gain", "--name"])
 
 
-def test_train_beside_seeds_of_other_settings(run: RunDirectory, refused: Refused) -> None:
+def test_train_beside_seeds_of_other_settings(same: Path, refused: Refused) -> None:
     """Seeds of one name differ in their budget at most; whoever compares them relies on it."""
-    config = run.path.parent / "same.toml"
-    settings: dict[str, Any] = {**TINY, "steps": 700, "eval_every": 200}
-    lines = [f"{k} = {list(v) if isinstance(v, tuple) else v}" for k, v in settings.items()]
-    config.write_text("\n".join(lines))
-    again = ["train", "td3", PROBE, "--seed", "1", "--config", config]
+    again = ["train", "td3", PROBE, "--seed", "1", "--config", same]
     says(refused(*again, "--gamma", "0.5"), ["td3/0", "gamma=0.99", "0.5", "--name"])
     says(refused(*again, "--env.gain", "2"), ["td3/0", "env_kwargs", "--name"])
     assert main([str(word) for word in [*again, "--steps", "300"]]) == 0

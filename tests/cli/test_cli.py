@@ -15,11 +15,13 @@ import demo
 import jax
 import pytest
 from short_runs import TINY, assert_same, run_to_end
+from stopping import raiser
 
 from pacesetter import algorithms, config
 from pacesetter.algorithms import ddpg
 from pacesetter.batch import Spec
-from pacesetter.cli.flags import split_env_kwargs
+from pacesetter.cli import progress
+from pacesetter.cli.flags import add_settings, parser, split_env_kwargs
 from pacesetter.cli.main import VERBS, main
 from pacesetter.config import Run, resolve
 from pacesetter.evaluation import evaluate
@@ -425,8 +427,30 @@ def test_flags_are_settings(algorithm: str, command: Command) -> None:
     assert directory.path.parts[-2:] == (settings["name"], str(settings["seed"]))
 
 
-def test_every_flag_is_tried() -> None:
-    """A new setting needs a place in SWITCHES."""
+@pytest.mark.parametrize("algorithm", algorithms.TABLE)
+def test_every_default_may_be_typed(algorithm: str) -> None:
+    """Each setting of each algorithm has a flag, and its default spelled out changes nothing."""
+    found = resolve(algorithm, "HalfCheetah-v5")
+    settings = {
+        key: value for key, value in found.settings().items() if value not in (None, (), {})
+    }
+    words: list[str] = []
+    for name in settings.keys() - {"algorithm", "env"}:
+        value, flag = settings[name], name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, list | tuple) else [value])]
+    command = parser("train", "")
+    for kind in (Run, algorithms.find(algorithm).Hyper):
+        add_settings(command, "settings", kind, None)
+    given = vars(command.parse(words))
+    assert given.keys() == settings.keys() - {"algorithm", "env"}
+    assert resolve(algorithm, "HalfCheetah-v5", given) == found
+
+
+def test_every_flag_of_a_run_and_of_ddpg_is_tried() -> None:
+    """A new setting of these needs a place in SWITCHES."""
     tried = {name for text, _ in SWITCHES.values() for name in typed(text)}
     settings = fields_of(Run).keys() | fields_of(ddpg.Hyper).keys()
     own_tests = {"start_from", "wrap", "randomize"}  # which need a run, a module, a keyword
@@ -517,6 +541,35 @@ def test_progress_goes_to_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     called = Path(*file.parent.parts[-3:])
     assert name == f"run: {called}, a name for show, eval, record, resume and compare"
     assert watch == f"film it: `pacesetter record {called} -o walk.mp4 --allow {PROBE}`"
+
+
+def test_out_of_memory_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VERBS, "list", raiser(MemoryError("9 GB")))
+    assert main(["list"]) == 1
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert "out of memory: 9 GB; ask for less, such as fewer members" in err
+
+
+def test_a_bar_on_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bar shows the run's steps and returns, and a warning is printed whole above it."""
+    warning = "at 1 update per second this run takes about [5 days] on this machine; Ctrl-C saves"
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setattr(progress, "LOOK_EVERY", 0.0)
+    said = iter([warning])
+    monkeypatch.setattr(progress.Slowness, "look", lambda *_: next(said, None))
+    monkeypatch.setenv("COLUMNS", "160")
+    assert main(["train", "td3", PROBE, *SMALL[:-1], "--steps", "250", "--eval-every", "100"]) == 0
+    out, err = capsys.readouterr()
+    assert f"pacesetter: {warning}" in err
+    assert f"{PROBE} td3 0" in err
+    assert "250/250" in err
+    assert "ETA" in err
+    assert out.startswith(f"{PROBE} td3 seed 0: 250 steps, return ")
 
 
 def test_eval_of_a_run(command: Command) -> None:

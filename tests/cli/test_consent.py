@@ -83,7 +83,7 @@ def refuses(capsys: pytest.CaptureFixture[str], name: str, *words: object) -> No
     assert "intruder" not in sys.modules
 
 
-@pytest.mark.parametrize("verb", ["eval", "resume", "record", "poster", "push"])
+@pytest.mark.parametrize("verb", ["eval", "resume", "record", "poster", "push", "watch"])
 def test_a_run_that_names_a_module(
     verb: str, made: RunDirectory, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,11 +18,11 @@ from policies import untrained
 from short_runs import TINY, run_to_end
 
 from pacesetter.cli.main import main
-from pacesetter.errors import UsageError
 from pacesetter.evaluation import evaluate
 from pacesetter.media import hub
+from pacesetter.media import record as film_module
+from pacesetter.media.record import Film
 from pacesetter.media.record import record as film
-from pacesetter.media.scene import INSTALL
 from pacesetter.policy import champions, load
 from pacesetter.training.trainer import Trainer
 
@@ -43,17 +43,6 @@ def pendulum(here: Path) -> Path:
     file = here / "pendulum.safetensors"
     untrained("Pendulum-v1", step=7, algorithm="td3").save(file)
     return file
-
-
-@pytest.fixture
-def gl(here: Path) -> None:
-    """Skip where this machine cannot draw."""
-    try:
-        film(untrained("HalfCheetah-v5"), here / "probe.gif", frames=1, size=(32, 32))
-    except UsageError as error:
-        if INSTALL not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
@@ -183,6 +172,19 @@ def test_export_to_sb3(pendulum: Path, capsys: pytest.CaptureFixture[str]) -> No
     model: Any = runpy.run_path("swing.py")["model"]
     seen = np.array([0.5, -0.5, 1.0], np.float32)
     assert np.array_equal(model.predict(seen)[0], load(pendulum)(seen))
+
+
+def test_record_hands_over_what_was_typed(
+    pendulum: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    double = create_autospec(film, return_value=Film(12, 4.0, [-1.0, -2.0]))
+    monkeypatch.setattr(film_module, "record", double)
+    flags = ["-o", "a.gif", "--episodes", "2", "--frames", "30", "--size", "64x48", "--no-text"]
+    assert main(["record", str(pendulum), *flags, "--seed", "5"]) == 0
+    assert capsys.readouterr().out == "a.gif: 12 frames, 3.0 s; return -1.0, -2.0\n"
+    (_, path), how = double.call_args
+    expected = {"episodes": 2, "frames": 30, "size": (64, 48), "text": False, "seed": 5}
+    assert (path, {key: how[key] for key in expected}) == ("a.gif", expected)
 
 
 def test_push_hands_over_what_was_typed(

@@ -201,4 +201,9 @@ def test_rescue_leaves_who_only_swings() -> None:
 
 @given(returns=RETURNS, factor=st.sampled_from([0.25, 2, 64]))
 def test_rescue_does_not_depend_on_the_unit_of_reward(returns: Any, factor: float) -> None:
-    assert parents_of("rescue", returns) == parents_of("rescue", factor * returns)
+    spread = returns[:, None] + np.abs(returns).max() * STEADY
+    found = [
+        choose("rescue", unit * spread, np.random.default_rng(0)).parents.tolist()
+        for unit in (1, factor)
+    ]
+    assert found[0] == found[1]

@@ -16,7 +16,7 @@ from short_runs import log, run_to_end
 from pacesetter.batch import Layout
 from pacesetter.cli.flags import add_settings, parser
 from pacesetter.config import Run, resolve
-from pacesetter.ensemble.rules import Choice
+from pacesetter.ensemble.rules import Choice, choose
 from pacesetter.ensemble.varied import decided, inherited, shown, spread
 from pacesetter.errors import UsageError
 from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
@@ -214,7 +214,8 @@ def test_pbt_hands_on_settings_perturbed_within_their_range(runs: Path) -> None:
 @pytest.mark.parametrize("rule", ["none", "rescue", "average"])
 def test_choices_without_scales_leave_settings(rule: str) -> None:
     before = [{"gamma": 1.0}, {"gamma": 2.0}]
-    choice = Choice(np.array([1, 1]), np.full((2, 2), 0.5) if rule == "average" else None)
+    choice = choose(rule, np.array([[0.0, 0.0], [9.0, 9.0]]), np.random.default_rng(0))
+    assert (choice.parents.tolist() == [1, 1]) == (rule != "none")
     assert inherited(choice, before) == before
 
 

@@ -10,17 +10,11 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
+from stopping import raiser
 
 from pacesetter.envs.calls import call
 from pacesetter.errors import TaskError
 from pacesetter.process import Interrupted, interrupt, stopping
-
-
-def raiser(error: BaseException) -> Callable[[], Any]:
-    def function() -> None:
-        raise error
-
-    return function
 
 
 @pytest.mark.parametrize(

@@ -60,6 +60,15 @@ def wait_for(what: Callable[[], object], process: subprocess.Popen[str]) -> None
         time.sleep(0.005)
 
 
+def raiser(error: BaseException) -> Callable[..., Any]:
+    """A function that raises this error."""
+
+    def function(*_: object) -> None:
+        raise error
+
+    return function
+
+
 def only_run(runs: Path) -> RunDirectory:
     """The only run below a folder."""
     (config,) = runs.rglob("config.json")

@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from numeric import SPEC
 from short_runs import TINY
 
 from pacesetter import Trainer, algorithms
-from pacesetter.batch import Layout, Spec
+from pacesetter.batch import Layout
 from pacesetter.config import resolve
 from pacesetter.learner.compiled import CompiledLearner, UpdateInputs
 
-SPEC = Spec(observation_size=3, action_size=2)
 SMALL: dict[str, Any] = {"hidden": (8,), "normalize_reward": True}
 CASES: dict[str, dict[str, Any]] = {
     "td3": SMALL,

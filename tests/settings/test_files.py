@@ -14,7 +14,7 @@ from pacesetter.settings.files import read_file
 
 READ = "import sys; from pacesetter.settings.files import *; print(read_file(Path(sys.argv[1])))"
 PACKAGE = Path(pacesetter.__file__).parent
-UNNAMED = re.compile(r'read_text\(\)|write_text\([^,\n]*\)$|\.open\(("[arwx]\+?")?\)')
+UNNAMED = re.compile(r'read_text\(\)|write_text\([^,\n]*\)$|\.open\(("[arwx]\+?")?\)', re.M)
 
 
 @pytest.mark.parametrize(("name", "text"), [("a.toml", 'name = "a"'), ("a.json", '{"name": "a"}')])

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import re
+import runpy
 import signal
 import stat
 import subprocess
@@ -24,6 +25,7 @@ import numpy as np
 import pytest
 from odd_places import folder, pipe
 from short_runs import assert_same
+from stopping import wait_for
 
 from pacesetter import algorithms
 from pacesetter.cli import bench_progress
@@ -751,14 +753,6 @@ def start(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
-def wait_for(what: Callable[[], object], process: subprocess.Popen[str]) -> None:
-    end = time.monotonic() + 120
-    while not what():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def test_interrupted_bench_saves_all_and_goes_on(jobs: list[Job]) -> None:
     """Ctrl-C reaches each run once; the next call ends them; the runs were pinned to a core."""
     long = ["--steps", "1M", "--eval-every", "1M", "--warmup", "1M", "--replay-size", "1k"]
@@ -991,6 +985,14 @@ def test_ray_cluster(jobs: list[Job]) -> None:
 def results_suite(name: str) -> list[Any]:
     """The runs of a suite of results/."""
     return expand(load(str(Path(__file__).parents[2] / "results" / name)), {}, "runs")
+
+
+@pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("results/*.toml")), ids=str)
+def test_every_suite_of_the_results_can_be_run_and_collected(file: Path) -> None:
+    """Its settings are known, and `results/summary.py` has a study of its name."""
+    assert results_suite(file.name)
+    summary = runpy.run_path(str(file.with_name("summary.py")))
+    assert file.stem in summary["STUDIES"]
 
 
 def spent(config: Any) -> tuple[int, float, int]:

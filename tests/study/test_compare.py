@@ -623,6 +623,13 @@ def test_without_a_file_a_table_is_printed(runs: Path, command: Any) -> None:
     assert "Against td3" in out
 
 
+def test_the_reference_and_the_budget_are_handed_on(runs: Path, command: Any) -> None:
+    code, out, err = command(runs, "--reference", "multi-td3", "--cpu", "300s", "--mixed")
+    assert (code, err) == (0, "")
+    assert out.startswith("Against multi-td3")
+    assert "Every run counts up to 300 CPU seconds." in out
+
+
 def test_files_are_written_in_each_form(runs: Path, tmp_path: Path, command: Any) -> None:
     words = ["-o", "a.md", "-o", "a.tex", "-o", "a.pdf", "--published", "--smooth", "5"]
     code, out, _ = command(runs, *words)

@@ -16,6 +16,7 @@ import broken_envs
 import jax
 import pytest
 from short_runs import TINY
+from stopping import raiser
 
 from pacesetter import algorithms
 from pacesetter.cli.main import main
@@ -52,13 +53,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = [str(Path(broken_envs.__file__).parent), os.environ.get("PYTHONPATH", "")]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     return tmp_path
-
-
-def raiser(error: Exception) -> Any:
-    def tick() -> None:
-        raise error
-
-    return tick
 
 
 def silent(trainer: Trainer) -> Any:

@@ -219,13 +219,14 @@ def test_bad_input(runs: Path, run: RunDirectory, port: int, capsys: Any) -> Non
         assert f"port: cannot use {taken}" in capsys.readouterr().err
 
 
-def test_ctrl_c_is_its_end(run: RunDirectory) -> None:
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_ctrl_c_is_its_end(run: RunDirectory, sent: signal.Signals, code: int) -> None:
     command = [sys.executable, "-m", "pacesetter", "live", str(run.path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout
         line = process.stdout.readline().decode()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        process.send_signal(sent)
+        assert process.wait(10) == code
         assert process.stderr
         assert process.stderr.read() == b""
     assert line.startswith("http://127.0.0.1:")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import tracker_files
-from short_runs import TINY
+from short_runs import CLOCKS, TINY
 
 from pacesetter.cli.main import main
 from pacesetter.runs import Row, RunDirectory
@@ -23,7 +23,6 @@ TASK = "probe_envs:Scripted-v0"
 SETTINGS: dict[str, Any] = TINY | {"members": 2, "steps": 400, "eval_every": 100, "warmup": 50}
 WORDS = ["--hidden", "8", "--batch-size", "8", "--warmup", "50", "--steps", "200", "-q"]
 WORDS += ["--eval-every", "100", "--eval-episodes", "1", "--replay-size", "1k"]
-CLOCKS = ("cpu_seconds", "wall_seconds")
 Points = dict[tuple[str, int], float]
 
 

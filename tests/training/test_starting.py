@@ -13,6 +13,7 @@ from short_runs import TINY, assert_same, log, run_to_end
 from stopping import stop_at
 
 from pacesetter import policy
+from pacesetter.cli.main import main
 from pacesetter.cli.show import state
 from pacesetter.config import resolve
 from pacesetter.errors import UsageError
@@ -251,6 +252,15 @@ def test_a_run_stops_after_evaluations_without_a_best_one(runs: Path) -> None:
     more = Trainer.resume(short.directory.path, stop_patience=1000)
     run_to_end(more)
     assert [r["mean"] for r in log(more.directory) if r["kind"] == "eval"][1:] == means
+
+
+def test_new_limits_may_be_typed(runs: Path) -> None:
+    short = trained(runs, steps=400, eval_every=100, stop_at=-1e9, stop_patience=50)
+    words = ["--stop-at", "1e9", "--stop-patience", "60", "--runs", str(runs), "-q"]
+    assert main(["resume", str(short.directory.path), *words]) == 0
+    run = short.directory.config().run
+    assert (run.stop_at, run.stop_patience) == (1e9, 60)
+    assert log(short.directory)[-1]["step"] == 400
 
 
 def test_evaluations_before_the_first_update_cannot_make_progress() -> None:

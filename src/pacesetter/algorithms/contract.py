@@ -24,7 +24,9 @@ class Update(NamedTuple):
 
     state: State
     losses: dict[str, Array]  # scalars; the run stops if one is not finite
-    td_error: Array  # (U, B) absolute TD errors, which a prioritised replay takes as feedback
+    # (U, B) absolute TD errors, which a prioritised replay takes as feedback; of any shape from a
+    # learner that has no replay, since nothing reads it.
+    td_error: Array
 
 
 class Learner:

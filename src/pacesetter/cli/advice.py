@@ -66,7 +66,8 @@ class Slowness:
     def _left(self) -> float:
         """Critic updates that the budget still asks for."""
         hyper: Any = self._trainer.config.hyper
-        steps = self._trainer.budget - max(self._trainer.progress.step, hyper.warmup)
+        idle = 0 if hyper.warmup_updates else hyper.warmup
+        steps = self._trainer.budget - max(self._trainer.progress.step, idle)
         return steps * hyper.updates_per_step
 
     def _limit(self) -> float:

@@ -17,9 +17,10 @@ class ByReturn(Sampler):
 
     An episode's rank u in (0, 1) is that of its return among the finished episodes in the window;
     ties share the mean rank. Its rows have priority (0.05 + u) ** exponent; rows of running
-    episodes take u = 0.5. With `to_go` each row has its own rank, by its undiscounted
-    return-to-go. Ranks depend on neither scale nor sign of returns. Priorities are bounded, so
-    rejection sampling is exact, and rows that left the window need no care.
+    episodes take u = 0.5. With `to_go` each row has its own rank in [0, 1], by its undiscounted
+    return-to-go among those of at most 4,096 rows. Ranks depend on neither scale nor sign of
+    returns. Priorities are bounded, so rejection sampling is exact, and rows that left the window
+    need no care.
     """
 
     def __init__(self, size: int, exponent: float, importance: float, to_go: bool) -> None:

@@ -31,7 +31,10 @@ class Evaluator:
         self._stopping = False
 
     def policy(self, member: int | None = None) -> Policy:
-        """The policy of the champion, or of a member, as it is now, and where it comes from."""
+        """The policy of the champion, or of a member, and where it comes from.
+
+        With `--assess` it is the best that was kept (`about["kept_at"]`), else what it is now.
+        """
         progress, run = self.loop.progress, self.config.run
         policy = self.loop.policy(progress.champion if member is None else member)
         names = ("env", "env_kwargs", "algorithm", "name", "seed")

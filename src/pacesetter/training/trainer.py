@@ -244,7 +244,13 @@ class Trainer:
             )
 
     def policy(self, member: int | None = None) -> Policy:
-        """The policy of the champion, or of a member, as it is now, and where it comes from."""
+        """The policy of the champion, or of a member, and where it comes from.
+
+        With `--assess` it is the best that was kept (`about["kept_at"]`), else what it is now.
+        """
+        members = self.config.run.members
+        if member is not None and not 0 <= member < members:
+            raise UsageError(f"member: must be from 0 to {members - 1}, got {member}")
         return self._evaluator.policy(member)
 
     def ledger(self) -> dict[str, Any]:
