@@ -507,7 +507,7 @@ def test_it_learns_that_a_fall_is_the_end(runs: Path) -> None:
 
 
 def test_presets() -> None:
-    """Defaults are the reference's; the small ones have narrower encoders or smaller batches."""
+    """Defaults are the reference's; the small ones have narrower encoders, smaller batches and a short warm-up."""
     hyper = resolve("td7", "Walker2d-v5").hyper
     assert (hyper.hidden, hyper.encoder_hidden, hyper.encoder_size) == ((256, 256), (256, 256), 256)
     assert (hyper.batch_size, hyper.copy_every, hyper.policy_delay) == (256, 250, 2)
@@ -515,6 +515,7 @@ def test_presets() -> None:
     assert (hyper.warmup, hyper.exploration_noise) == (25_000, 0.1)
     small = resolve("td7-small", "Walker2d-v5").hyper
     assert (small.batch_size, small.encoder_hidden, small.encoder_size) == (128, (96, 96), 96)
+    assert small.warmup == 5_000
 
 
 def test_a_copy_that_td7_cannot_make_is_refused_before_anything_is_written(runs: Path) -> None:
