@@ -507,7 +507,7 @@ def test_it_learns_that_a_fall_is_the_end(runs: Path) -> None:
 
 
 def test_presets() -> None:
-    """Defaults are the reference's; the small ones have narrower encoders, smaller batches and a short warm-up."""
+    """Defaults are the reference's; the small one has narrower encoders, batches and warm-up."""
     hyper = resolve("td7", "Walker2d-v5").hyper
     assert (hyper.hidden, hyper.encoder_hidden, hyper.encoder_size) == ((256, 256), (256, 256), 256)
     assert (hyper.batch_size, hyper.copy_every, hyper.policy_delay) == (256, 250, 2)
