@@ -90,8 +90,7 @@ class Config(NamedTuple):
     def lr_updates(self) -> float:
         """Critic updates of one member until its learning rates have fallen to `--lr-end`."""
         hyper = self.hyper
-        idle = 0 if hyper.warmup_updates else hyper.warmup
-        learning = max((hyper.lr_horizon or 0) * self.steps_per_count - idle, 1)
+        learning = max((hyper.lr_horizon or 0) * self.steps_per_count - hyper.idle_steps, 1)
         return learning / self.run.members * hyper.updates_per_step
 
     def settings(self) -> Settings:

@@ -6,17 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from numeric import (
-    KEY,
-    SPEC,
-    close,
-    member,
-    near,
-    random_batch,
-    random_state,
-    same,
-    single,
-)
+from numeric import KEY, SPEC, close, member, near, random_batch, random_state, same, single
 from short_runs import TINY, assert_same, run_to_end, run_to_step
 
 from pacesetter.algorithms import td7

@@ -220,7 +220,7 @@ def test_bad_input(runs: Path, run: RunDirectory, port: int, capsys: Any) -> Non
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
-def test_ctrl_c_is_its_end(run: RunDirectory, sent: signal.Signals, code: int) -> None:
+def test_a_signal_is_its_end(run: RunDirectory, sent: signal.Signals, code: int) -> None:
     command = [sys.executable, "-m", "pacesetter", "live", str(run.path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout

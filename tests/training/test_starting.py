@@ -16,7 +16,9 @@ from pacesetter import policy
 from pacesetter.cli.main import main
 from pacesetter.cli.show import state
 from pacesetter.config import resolve
+from pacesetter.envs import Recipe
 from pacesetter.errors import UsageError
+from pacesetter.evaluation import evaluate
 from pacesetter.runs import RunDirectory
 from pacesetter.settings.budget import Standing, standing
 from pacesetter.study.bench.queue import Job, is_finished
@@ -252,6 +254,21 @@ def test_a_run_stops_after_evaluations_without_a_best_one(runs: Path) -> None:
     more = Trainer.resume(short.directory.path, stop_patience=1000)
     run_to_end(more)
     assert [r["mean"] for r in log(more.directory) if r["kind"] == "eval"][1:] == means
+
+
+def test_a_member_that_the_run_has_not_is_refused(runs: Path) -> None:
+    trainer = Trainer("td3", ENV, runs=runs, members=2, **SHORT)
+    assert trainer.policy(1).about["step"] == 0
+    for member in (-1, 2):
+        with pytest.raises(UsageError, match=f"member: must be from 0 to 1, got {member}"):
+            trainer.policy(member)
+    trainer.close()
+
+
+def test_keywords_beside_a_recipe_are_refused() -> None:
+    with pytest.raises(UsageError, match="env_kwargs: a Recipe has its own"):
+        evaluate(None, Recipe(ENV), 1, env_kwargs={"g": 9.0})
+    assert len(evaluate(None, Recipe(ENV, {"g": 9.0}), 1).returns) == 1
 
 
 def test_new_limits_may_be_typed(runs: Path) -> None:

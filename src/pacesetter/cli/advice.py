@@ -66,8 +66,7 @@ class Slowness:
     def _left(self) -> float:
         """Critic updates that the budget still asks for."""
         hyper: Any = self._trainer.config.hyper
-        idle = 0 if hyper.warmup_updates else hyper.warmup
-        steps = self._trainer.budget - max(self._trainer.progress.step, idle)
+        steps = self._trainer.budget - max(self._trainer.progress.step, hyper.idle_steps)
         return steps * hyper.updates_per_step
 
     def _limit(self) -> float:

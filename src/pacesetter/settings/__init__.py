@@ -179,6 +179,11 @@ class OffPolicy(Hyper):
         return self.normalize_reward
 
     @property
+    def idle_steps(self) -> int:
+        """Env steps at the start that call for no update."""
+        return 0 if self.warmup_updates else self.warmup
+
+    @property
     def block(self) -> int:
         """Env steps of a member after which its due updates are made."""
         return self.update_every or 1

@@ -1,6 +1,7 @@
 """A comparison written in the form that a file's name asks for."""
 
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 
@@ -34,7 +35,8 @@ class Options:
 
 def check(paths: list[str], options: Options) -> list[Path]:
     """Refuse what cannot be written before anything is computed."""
-    for path in map(Path, paths):
+    files = [Path(path) for path in paths]
+    for path in files:
         if path.suffix not in SUFFIXES:
             raise UsageError(f"-o: {path} must end in {', '.join(SUFFIXES)}")
         if not path.parent.is_dir():
@@ -47,8 +49,8 @@ def check(paths: list[str], options: Options) -> list[Path]:
             f"got {options.smooth}"
         )
     if options.axis is not None:
-        _check_axis(options.axis, [Path(path).suffix for path in paths])
-    return [Path(path) for path in paths]
+        _check_axis(options.axis, [path.suffix for path in files])
+    return files
 
 
 def _check_axis(axis: str, suffixes: list[str]) -> None:
@@ -84,11 +86,10 @@ def write(comparison: Comparison, path: Path, options: Options) -> None:
         if path.suffix in (".pdf", *PICTURES):
             from pacesetter.study.report import figures
 
+            picture = partial(figures.picture, axis=options.axis or "steps")
+            draw = figures.pdf if path.suffix == ".pdf" else picture
             with replacing(path) as file:
-                if path.suffix == ".pdf":
-                    figures.pdf(comparison, file, options.smooth)
-                else:
-                    figures.picture(comparison, file, options.smooth, options.axis or "steps")
+                draw(comparison, file, options.smooth)
         else:
             write_atomically(path, _page(comparison, path.suffix, options).encode())
 
