@@ -35,6 +35,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "frontier": [
         {"budget": "100k", "reference": "td3-norm-128x2"},
         {"budget": "100k", "reference": "crossq-small"},
+        {"budget": "150k", "reference": "crossq-small-bf16"},
     ],
     "pilot": [
         {"budget": "100k"},
