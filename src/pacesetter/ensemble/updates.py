@@ -29,6 +29,7 @@ class Updates:
     ) -> None:
         self.config, self.learners, self.experience = config, learners, experience
         self.progress, self.averages = progress, averages
+        self.lr_updates = config.lr_updates
         self.per_call = learners.compiled.learner.updates_per_call
 
     def make(self, members: Sequence[int]) -> None:
@@ -40,7 +41,7 @@ class Updates:
         for k, sample in zip(members, samples, strict=True):
             member, data = self.progress.members[k], (sample.rows, sample.weight, statistics)
             made = member.update_calls * self.per_call
-            scales = factors(self.config.hyper, member.scales, made, self.config.lr_updates)
+            scales = factors(self.config.hyper, member.scales, made, self.lr_updates)
             inputs.append(UpdateInputs(member.update_calls, *data, extra, scales))
         results = self.learners.update(members, inputs)
         for k, sample, result in zip(members, samples, results, strict=True):
