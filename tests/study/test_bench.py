@@ -1090,6 +1090,38 @@ def test_settings_of_a_task_hold_for_its_id_without_a_version(here: Path) -> Non
     assert (job.config.run.env, job.config.run.steps) == ("Pendulum-v1", 3_000)
 
 
+@pytest.mark.parametrize(
+    ("entry", "flags", "steps"),
+    [
+        ("", {}, 2_000),
+        ("steps = 3_000", {}, 3_000),
+        ('config = "mine.toml"', {}, 4_000),
+        ('[entries.td3.env."Pendulum-*"]\nsteps = 5_000', {}, 5_000),
+        ("steps = 3_000", {"steps": 6_000}, 6_000),
+    ],
+)
+def test_settings_of_all_entries_for_a_task(
+    here: Path, entry: str, flags: dict[str, Any], steps: int
+) -> None:
+    """They win over the suite's for all tasks, and lose to a file, an entry and flags."""
+    (here / "mine.toml").write_text("steps = 4_000")
+    (here / "own.toml").write_text(
+        'steps = 1_000\nenvs = ["Pendulum-v1", "MountainCarContinuous-v0"]\n'
+        f'[env."Pendulum-*"]\nsteps = 2_000\n[entries.td3]\n{entry}\n'
+    )
+    jobs = {job.config.run.env: job.config.run.steps for job in expand(load("own.toml"), flags, "")}
+    assert jobs["Pendulum-v1"] == steps
+    if not entry:
+        assert jobs["MountainCarContinuous-v0"] == 1_000
+
+
+@pytest.mark.parametrize("where", ["env", "entries.td3.env"])
+def test_what_is_for_all_tasks_cannot_be_of_one(here: Path, where: str) -> None:
+    (here / "own.toml").write_text(f'[entries.td3]\n[{where}."Pendulum-*"]\nseeds = 2\n')
+    with pytest.raises(UsageError, match=r"seeds: is for all tasks; it cannot stand in env"):
+        expand(load("own.toml"), {"envs": ["Pendulum-v1"]}, "")
+
+
 def test_a_keyword_of_none_stays_none(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["bench", "--algos", "td3", "--envs", "Pendulum-v1", "--seeds", "1", "--print"]
     assert main([*words, "commands", "--env.render_mode", "none"]) == 0

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from pacesetter.networks.forward import NORM_EPSILON
 from pacesetter.types import Layers
 
 Array = jax.Array
 Layer = dict[str, Array]
 Network = tuple[Layer, ...]
-NORM_EPSILON = 1e-5
 
 
 def dense(key: Array, fan_in: int, fan_out: int, bound: float | None = None) -> Layer:

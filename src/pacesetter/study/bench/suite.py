@@ -118,27 +118,28 @@ def expand(
         try:
             for env in _envs(merged.get("envs")):
                 below = _file(suite, merged.get("config"), env)
-                own = merge(suite.shared, below, *_for_env(entry, env), flags)
+                shared, own = _for_env(suite.shared, env), _for_env(entry, env)
+                given = merge(*shared, below, *own, flags)
                 if "wrap" not in flags:
-                    require_all("wrap", own.get("wrap", ()), suite.allow)
-                jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), own, runs)
+                    require_all("wrap", given.get("wrap", ()), suite.allow)
+                jobs += _jobs(name, env, _seeds(merged.get("seeds", 1)), given, runs)
         except UsageError as error:
             raise UsageError(f"{suite.name}, entry {name}: {error}") from None
     jobs = [job._replace(always=(*always, *job.always)) for job in jobs]
     return sorted(jobs, key=lambda job: job.config.run.seed)
 
 
-def _for_env(entry: Settings, env: str) -> Iterable[Settings]:
-    """An entry's settings for a task: `env."PATTERN"` tables win over the rest, as in presets."""
-    by_env: Any = entry.get("env", {})
+def _for_env(table: Settings, env: str) -> Iterable[Settings]:
+    """A suite's or an entry's settings for a task: `env."PATTERN"` wins over the rest of it."""
+    by_env: Any = table.get("env", {})
     if not isinstance(by_env, dict) or not all(isinstance(t, dict) for t in by_env.values()):
         raise UsageError('env: must be tables of settings by task, such as env."HalfCheetah-*"')
-    yield {key: value for key, value in entry.items() if key != "env"}
-    for pattern, table in by_env.items():
-        if own := sorted(OF_ENTRIES & table.keys()):
-            raise UsageError(f'{own[0]}: is of the whole entry; it cannot stand in env."{pattern}"')
+    yield {key: value for key, value in table.items() if key != "env"}
+    for pattern, own in by_env.items():
+        if wrong := sorted(OF_ENTRIES & own.keys()):
+            raise UsageError(f'{wrong[0]}: is for all tasks; it cannot stand in env."{pattern}"')
         if fnmatchcase(env, pattern):
-            yield _with_underscores(table)
+            yield _with_underscores(own)
 
 
 def _jobs(
