@@ -19,7 +19,7 @@ from pacesetter.process import multiplies_bfloat16, stopping
 from pacesetter.runs import RunDirectory
 
 # Without such instructions products of bfloat16 are slower than those of float32.
-ALGORITHM = "quick" if multiplies_bfloat16() else "crossq-small"
+PRECISION = "bf16" if multiplies_bfloat16() else "f32"
 ENV, RUNS = "HalfCheetah-v5", Path("runs")
 NAME = "demo"  # so that no later `pacesetter train` finds its folder taken
 RUN = RUNS / ENV / NAME / "0"
@@ -52,7 +52,8 @@ def open_run() -> Trainer:
     """A new run, or the one that an earlier call began."""
     if not RunDirectory(RUN).config_file.exists():
         say(f"training into {RUN} for at most 5 minutes; Ctrl-C saves, and a new call goes on")
-        return Trainer(ALGORITHM, ENV, name=NAME, runs=RUNS, steps=150_000, time="5m")
+        settings = {"steps": 150_000, "time": "5m", "precision": PRECISION}
+        return Trainer("td7-small", ENV, name=NAME, runs=RUNS, **settings)
     trainer = Trainer.resume(RUN, runs=RUNS)
     for note in trainer.notes:
         say(note)

@@ -617,6 +617,21 @@ def test_the_demo_saves_on_ctrl_c(runs: Path) -> None:
     assert resumed.progress.step == 51
 
 
+def test_the_demo_begins_a_run_and_takes_it_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trainer = demo.open_run()
+    for _ in trainer:
+        break
+    again = demo.open_run()
+    again.close()
+    for each in (trainer, again):
+        assert each.config.run.env == "HalfCheetah-v5"
+        assert each.config.hyper.encoder_size == resolve("td7-small", demo.ENV).hyper.encoder_size
+        assert each.config.run.time == 300
+
+
 def test_iterator_breaks_and_goes_on(runs: Path) -> None:
     """`break` saves; `resume` continues; both together equal one run."""
     settings = {**TINY, "steps": 700, "eval_every": 200}
