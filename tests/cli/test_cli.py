@@ -379,7 +379,7 @@ SWITCHES: dict[str, tuple[str, dict[str, Any]]] = {
     "multi-sac": (
         "--steps 600 --hidden 8 --batch-size 8 --warmup 50 --num-envs 2 --lr-end 0.5 "
         "--lr-horizon 900 --stop-at 1000000 --stop-patience 99 --normalize-reward --keep 2 "
-        "--mean-actions on --ema-tau 0.1 "
+        "--mean-actions on --ema-tau 0.1 --eval-policy ema "
         "--snapshots 2 --no-renew-env --vary gamma=0.98,0.99 --vary-by draw",
         {"vary": {"gamma": [0.98, 0.99]}},
     ),

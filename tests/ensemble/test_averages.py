@@ -13,7 +13,7 @@ from short_runs import content, log, run_to_end
 from pacesetter import storage
 from pacesetter.ensemble.averages import mean_action
 from pacesetter.ensemble.rules import Choice
-from pacesetter.policy import Policy
+from pacesetter.policy import Policy, load
 from pacesetter.runs import RunDirectory
 from pacesetter.training.trainer import Trainer
 
@@ -118,6 +118,49 @@ def test_before_any_update_means_are_those_of_fresh_actors(runs: Path) -> None:
     members, ema = row["mean_actions"]["members"], row["mean_actions"]["ema"]
     assert row["step"] == 0
     assert members == ema
+
+
+@pytest.mark.parametrize("mean_actions", ["auto", "on", "off"])
+def test_the_mean_of_ema_actors_can_be_what_is_evaluated(runs: Path, mean_actions: str) -> None:
+    """Training is the same; champion and mean change places in the log, and its file is the mean.
+
+    With normalized observations and assessed policies, whose statistics are older than the run's.
+    """
+    same_run: dict[str, Any] = {"rule": "none", "eval_every": 30, "eval_episodes": 2}
+    same_run |= {"normalize_observation": True, "assess": 1, "snapshots": 2, "steps": 120}
+    usual = run_to_end(start(runs, name="usual", mean_actions="on", **same_run))
+    trainer = start(runs, name="ema", eval_policy="ema", mean_actions=mean_actions, **same_run)
+    directory = run_to_end(trainer)
+    for one, other in zip(evaluations(usual), evaluations(directory), strict=True):
+        assert other["returns"] == pytest.approx(one["mean_actions"]["ema"]["returns"], rel=1e-5)
+        means, expected = other.get("mean_actions", {}), dict(one["mean_actions"])
+        del expected["ema"]
+        if mean_actions == "off":
+            del expected["members"]
+        else:
+            expected["champion"] = {name: one[name] for name in ("mean", "std", "returns")}
+        assert means == expected
+        if "members" in other:
+            assert other["members"] == one["members"]
+    saved, kept = load(directory.policy_file), trainer.loop.policy(trainer.progress.champion)
+    assert (len(saved.actors), len(kept.actors)) == (2, 1)
+    assert saved.about["eval_policy"] == "ema"
+    assert "kept_at" in kept.about
+    assert "kept_at" not in saved.about
+    assert not same(saved.normalizer, kept.normalizer)
+    assert same(saved.normalizer, trainer.loop.experience.normalizer.statistics())
+    observation = np.zeros(saved.observation_size, np.float32)
+    expected = mean_action(trainer.loop.averaged(kept)["ema"])(observation)
+    np.testing.assert_allclose(saved.act(observation), expected, rtol=1e-6)
+    assert same(trainer.policy(0).actors, trainer.loop.policy(0).actors)
+
+
+def test_ema_is_evaluated_of_one_member_too(runs: Path) -> None:
+    settings = {"algorithm": "td3", "steps": 60}
+    usual = evaluations(run_to_end(start(runs, name="on", mean_actions="on", **settings)))
+    found = evaluations(run_to_end(start(runs, name="ema", eval_policy="ema", **settings)))
+    assert [row["mean"] for row in found] == [row["mean_actions"]["ema"]["mean"] for row in usual]
+    assert all("mean_actions" not in row for row in found)
 
 
 def test_snapshots_are_the_last_champions(runs: Path) -> None:

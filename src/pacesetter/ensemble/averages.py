@@ -1,4 +1,4 @@
-"""Mean actions that are evaluated beside the champion: of members, EMA actors and snapshots.
+"""Mean actions that are evaluated: of members, of their EMA actors, and of snapshots.
 
 An EMA actor is a tree of weights beside a member's state that moves a little towards the member's
 actor after each of its updates. Nothing here is ever learned from or acts in training.
@@ -45,7 +45,7 @@ class Averages:
 
     def follow(self, k: int) -> None:
         """Move the EMA actor of member k towards its actor, after an update."""
-        if not self.run.evaluates_means:
+        if not self.run.keeps_ema:
             return
         compiled, state = self.learners.compiled, self.learners.states[k]
         if self.ema[k] is None:
@@ -73,7 +73,7 @@ class Averages:
         found: dict[str, list[Policy]] = {}
         if len(members) > 1 and self.run.evaluates_means:
             found["members"] = list(members)
-        if self.run.evaluates_means:
+        if self.run.keeps_ema:
             pairs = zip(now, self.ema, strict=True)
             found["ema"] = [
                 policy if ema is None else replace(policy, actors=unstack(ema))
@@ -110,6 +110,11 @@ class Averages:
         self.snapshots = []
         for i in range(saved.snapshots):
             self.snapshots.append(rebuilt_policy(self.like, below(f"snapshots.{i}", arrays)))
+
+
+def mean_policy(policies: Sequence[Policy]) -> Policy:
+    """One policy that acts by the mean action of some with the same observation statistics."""
+    return replace(policies[0], actors=[actor for each in policies for actor in each.actors])
 
 
 def mean_action(policies: Sequence[Policy]) -> Callable[[Floats], Floats]:

@@ -86,6 +86,11 @@ class Ensemble:
         "grid",
         description="spread members over the grid of --vary, or draw every value equally often",
     )
+    eval_policy: Literal["champion", "ema"] = Field(
+        "champion",
+        description="what is evaluated and saved: the champion's policy, or the mean action of all "
+        "members' EMA actors",
+    )
     mean_actions: Literal["auto", "on", "off"] = Field(
         "auto",
         description="also evaluate the mean action of all members, and that of their EMA actors; "
@@ -103,6 +108,11 @@ class Ensemble:
     def evaluates_means(self) -> bool:
         """Whether the mean actions of members and of their EMA actors are evaluated."""
         return self.mean_actions == "on" or (self.mean_actions == "auto" and self.members > 1)
+
+    @property
+    def keeps_ema(self) -> bool:
+        """Whether members have EMA actors."""
+        return self.evaluates_means or self.eval_policy == "ema"
 
     @property
     def window(self) -> int:

@@ -70,6 +70,8 @@ class RunSettings(TypedDict, total=False):
     """settings that differ between members, such as gamma=0.98,0.99; may be repeated; one of..."""
     vary_by: Literal["grid", "draw"]
     """spread members over the grid of --vary, or draw every value equally often"""
+    eval_policy: Literal["champion", "ema"]
+    """what is evaluated and saved: the champion's policy, or the mean action of all members'..."""
     mean_actions: Literal["auto", "on", "off"]
     """also evaluate the mean action of all members, and that of their EMA actors; auto: with..."""
     ema_tau: float

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.config import Config
-from pacesetter.ensemble.averages import mean_action
+from pacesetter.ensemble.averages import mean_action, mean_policy
 from pacesetter.ensemble.loop import Loop
 from pacesetter.ensemble.varied import shown
 from pacesetter.envs import Environment, Recipe
@@ -23,7 +23,7 @@ class Stopped(Exception):  # noqa: N818 (it is no error)
 
 
 class Evaluator:
-    """Rolls out the champion of a loop, its other members, and their mean actions."""
+    """Rolls out what `--eval-policy` names, and beside it members and mean actions."""
 
     def __init__(self, loop: Loop, config: Config, directory: RunDirectory, recipe: Recipe) -> None:
         self.loop, self.config, self.directory, self.recipe = loop, config, directory, recipe
@@ -31,12 +31,16 @@ class Evaluator:
         self._stopping = False
 
     def policy(self, member: int | None = None) -> Policy:
-        """The policy of the champion, or of a member, and where it comes from.
+        """A member's policy, or what `--eval-policy` names, and where it comes from.
 
-        With `--assess` it is the best that was kept (`about["kept_at"]`), else what it is now.
+        With `--assess` a member's is the best that was kept (`about["kept_at"]`), else what it is
+        now.
         """
         progress, run = self.loop.progress, self.config.run
         policy = self.loop.policy(progress.champion if member is None else member)
+        if member is None and run.eval_policy == "ema":
+            policy = mean_policy(self.loop.averaged(policy)["ema"])
+            policy.about.update(eval_policy=run.eval_policy)
         names = ("env", "env_kwargs", "algorithm", "name", "seed")
         policy.about.update({name: getattr(run, name) for name in names})
         policy.about.update(wrap=[*self.recipe.wrap], renew_env=self.recipe.renew)
@@ -46,24 +50,25 @@ class Evaluator:
         return policy
 
     def evaluate(self, ending: bool) -> dict[str, Any]:
-        """Evaluate the champion and write its policy files; the values of a row of the log.
+        """Evaluate the policy and write its files; the values of a row of the log.
 
         Nothing changes before all is played. Raises Stopped after `stop`.
         """
         run, progress = self.config.run, self.loop.progress
         self.loop.learners.refuse_faults(range(run.members), progress.step)
-        policy = self.policy()
+        policy, champion = self.policy(), self.policy(progress.champion)
         trial = self._trial(policy.act, progress.champion)
         values = trial.table() | {"champion": progress.champion}
-        if means := self._mean_actions(policy):
+        if means := self._mean_actions(champion):
             values["mean_actions"] = means
         if run.vary:
             scales = [member.scales for member in progress.members]
             values["settings"] = shown(run, self.config.hyper, scales)
         if run.members > 1 and (run.mean_actions == "on" or (ending and run.rule == "none")):
-            values["members"] = self._each_member(trial)
+            played = trial if run.eval_policy == "champion" else None
+            values["members"] = self._each_member(played)
         self._save(policy, trial)
-        self.loop.keep_snapshot(policy)
+        self.loop.keep_snapshot(champion)
         return values
 
     def stop(self) -> None:
@@ -92,18 +97,24 @@ class Evaluator:
             policy.save(self.directory.best_file)
 
     def _mean_actions(self, champion: Policy) -> dict[str, Any]:
-        """Mean, deviation and returns of each mean action, on the champion's starts."""
-        found: dict[str, Any] = {}
-        for name, policies in self.loop.averaged(champion).items():
+        """Mean, deviation and returns of each policy beside the evaluated one, on its starts."""
+        run, found = self.config.run, dict[str, Any]()
+        beside = self.loop.averaged(champion)
+        if run.eval_policy == "ema":
+            del beside["ema"]
+            beside |= {"champion": [champion]} if run.evaluates_means else {}
+        for name, policies in beside.items():
             trial = self._trial(mean_action(policies), self.loop.progress.champion)
             found[name] = {"mean": trial.mean, "std": trial.std, "returns": trial.returns}
         return found
 
-    def _each_member(self, champions: Evaluation) -> list[float]:
-        """Mean return of every member on the same starts; the champion has had its trial."""
+    def _each_member(self, champions: Evaluation | None) -> list[float]:
+        """Mean return of every member on the same starts; the champion may have had its trial."""
         champion = self.loop.progress.champion
         return [
-            champions.mean if k == champion else self._trial(self.policy(k).act, k).mean
+            champions.mean
+            if champions and k == champion
+            else self._trial(self.policy(k).act, k).mean
             for k in range(self.config.run.members)
         ]
 
