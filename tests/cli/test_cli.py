@@ -130,7 +130,11 @@ DEFAULTS = {
     ("ddpg-original", "HalfCheetah-v5"): {"warmup": "10000", "exploration": "ou"},
     ("crossq", "Ant-v5"): {"critic-hidden": "2048 2048", "exploration": "policy"},
     ("crossq-small", "Ant-v5"): {"critic-hidden": "256 256", "hidden": "256 256"},
-    ("quick", "HalfCheetah-v5"): {"critic-hidden": "256 256", "precision": "bf16"},
+    ("quick", "HalfCheetah-v5"): {
+        "critic-hidden": "256 256",
+        "precision": "bf16",
+        "eval-policy": "ema",
+    },
 }
 
 
