@@ -63,7 +63,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
 }
 
 # Studies of which every policy that was evaluated counts apart.
-APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha")
+APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier")
 
 
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
@@ -93,11 +93,12 @@ def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
 
 def apart(run: RunDirectory, line: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Lines of the run's other policies, as if each were a run: `none-members` has the mean returns
-    of the members alone, `none-mean` those of their mean action, `none-ema` of their EMA actors'.
+    of the members alone, `none-mean` those of their mean action, `none-ema` of their EMA actors',
+    and `none-champion` those of the champion where the EMA actors are what is evaluated.
     """
     rows, place = run.rows("eval"), line["columns"].index("returns")
     found = {"members": [row.get("members") for row in rows]}
-    for name, key in (("mean", "members"), ("ema", "ema")):
+    for name, key in (("mean", "members"), ("ema", "ema"), ("champion", "champion")):
         means = [row.get("mean_actions", {}).get(key) for row in rows]
         found[name] = [each and each["returns"] for each in means]
     for name, returns in found.items():

@@ -633,6 +633,7 @@ def test_the_demo_begins_a_run_and_takes_it_up(
     for each in (trainer, again):
         assert each.config.run.env == "HalfCheetah-v5"
         assert each.config.hyper.encoder_size == resolve("td7-small", demo.ENV).hyper.encoder_size
+        assert each.config.hyper.precision == demo.PRECISION
         assert each.config.run.time == 300
 
 

@@ -155,6 +155,23 @@ def test_the_mean_of_ema_actors_can_be_what_is_evaluated(runs: Path, mean_action
     assert same(trainer.policy(0).actors, trainer.loop.policy(0).actors)
 
 
+@pytest.mark.parametrize("algorithm", ["td3", "crossq", "td7", "sunrise"])
+def test_training_is_the_same_whatever_is_evaluated(runs: Path, algorithm: str) -> None:
+    """To the last bit: states, averages, replay and the log of training."""
+    found: list[Any] = []
+    for policy in ("champion", "ema"):
+        settings: dict[str, Any] = {"algorithm": algorithm, "members": 2, "name": policy}
+        settings |= {"mean_actions": "on", "eval_policy": policy, "eval_every": 40}
+        trainer = start(runs, **settings)
+        run = content(run_to_end(trainer))
+        found.append((run["arrays"], [row for row in run["log"] if row["kind"] != "eval"]))
+        own = len(trainer.loop.policy(0).actors)
+        assert len(load(trainer.directory.policy_file).actors) == own * (1 + (policy == "ema"))
+    (one, rows), (other, others) = found
+    assert same(one, other)
+    assert rows == others
+
+
 def test_ema_is_evaluated_of_one_member_too(runs: Path) -> None:
     settings = {"algorithm": "td3", "steps": 60}
     usual = evaluations(run_to_end(start(runs, name="on", mean_actions="on", **settings)))

@@ -251,6 +251,32 @@ def test_a_setting_that_only_newer_runs_have_is_no_difference(tmp_path: Path) ->
     assert len(compare([tmp_path]).runs) == 2
 
 
+def test_a_run_from_before_there_was_eval_policy_evaluated_the_champion(tmp_path: Path) -> None:
+    """Its seeds are not pooled with those of an average; between groups a line says it."""
+    small(tmp_path, seed=0)
+    small(tmp_path, seed=1, eval_policy="champion")
+    small(tmp_path, name="sac", eval_policy="champion")
+    assert not any("(eval_policy)" in note for note in compare([tmp_path]).notes)
+    small(tmp_path, name="crossq", eval_policy="ema")
+    assert any("(eval_policy)" in note for note in compare([tmp_path]).notes)
+    small(tmp_path, seed=2, eval_policy="ema")
+    with pytest.raises(UsageError, match="td3 has eval_policy champion and ema"):
+        compare([tmp_path])
+
+
+def test_a_new_seed_of_an_older_run_evaluates_as_it_did(tmp_path: Path) -> None:
+    settings: dict[str, Any] = {**TINY, "steps": 100}
+    first = Trainer("td3", "Pendulum-v1", runs=tmp_path, **settings)
+    run_to_end(first)
+    file = first.directory.config_file
+    table = json.loads(file.read_text())
+    del table["settings"]["eval_policy"]
+    file.write_text(json.dumps(table))
+    with pytest.raises(UsageError, match="eval_policy=champion, not ema"):
+        Trainer("td3", "Pendulum-v1", runs=tmp_path, **settings, seed=1, eval_policy="ema")
+    Trainer("td3", "Pendulum-v1", runs=tmp_path, **settings, seed=1).close()
+
+
 def test_uncounted_selection_steps_are_told(tmp_path: Path) -> None:
     small(tmp_path, name="multi-td3", count_selection_steps=False)
     assert any("Steps of selection come on top" in note for note in compare([tmp_path]).notes)

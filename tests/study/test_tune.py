@@ -418,6 +418,16 @@ def test_settings_without_a_score_are_no_other_study() -> None:
         study(gamma=0.99)
 
 
+def test_a_study_from_before_there_was_eval_policy_evaluated_the_champion() -> None:
+    study()
+    file, setting = Path("study.log"), '"eval_policy":"champion",'
+    assert setting in file.read_text()
+    file.write_text(file.read_text().replace(setting, ""))
+    study()
+    with pytest.raises(UsageError, match="eval_policy=champion, not ema"):
+        study(eval_policy="ema")
+
+
 def test_study_of_something_else_is_refused() -> None:
     study()
     for other, said in {("td3", "gamma"): "gamma", ("sac", "gamma"): "algorithm"}.items():

@@ -148,6 +148,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: P
     file, run = old.directory.policy_file, old.directory.path
     scaled = trained(runs, name="scaled", normalize_observation=True).directory.policy_file
     normed = trained(runs, name="normed", actor_layer_norm=True).directory.path
+    pair = trained(runs, name="pair", members=2, eval_policy="ema").directory.policy_file
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(file.read_bytes()[:-7])
     for source, changes, words in [
@@ -161,6 +162,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(runs: Path, tmp_path: P
         (file, {"algorithm": "td7-small"}, "TD7 cannot take the actor of a policy file"),
         (scaled, {}, "acts on normalized observations"),
         (file, {"normalize_observation": True}, "acts on the task's own observations"),
+        (pair, {}, "averages 2 actors, and a member has one"),
         (damaged, {}, "damaged"),
         (tmp_path / "none.safetensors", {}, "none.safetensors"),
         ("nowhere", {}, "'nowhere' not found"),

@@ -42,7 +42,7 @@ def evaluate(words: list[str]) -> int:
 
 
 def _parser() -> Parser:
-    command = parser("eval", "Score a run's champion, or a policy file, on fresh episodes.")
+    command = parser("eval", "Score a run's policy, or a policy file, on fresh episodes.")
     add = command.add_argument
     add_run(command)
     add("--episodes", type=int, default=100, metavar="N", help="episodes to play (default 100)")

@@ -117,7 +117,7 @@ HINTS = {
 
 
 def runs(folder: str) -> list[Row]:
-    """Runs below a folder: how far each is and how its champion scores."""
+    """Runs below a folder: how far each is and how its policy scores."""
     rows: list[Row] = []
     for run in find_all(folder):
         row: Row = {"name": str(run.path)}

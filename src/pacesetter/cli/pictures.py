@@ -10,7 +10,7 @@ from pacesetter.cli.streams import aside
 
 def record(words: list[str]) -> int:
     """Film a policy as .mp4 or .gif."""
-    command = parser("record", "Film a run's champion, or a policy file, without a display.")
+    command = parser("record", "Film a run's policy, or a policy file, without a display.")
     add_run(command)
     add = command.add_argument
     add("-o", default="walk.mp4", metavar="FILE", help="a .mp4 or .gif (default walk.mp4)")

@@ -53,7 +53,7 @@ def _line(axes: Any, evaluations: list[Row]) -> None:
         color=COLOUR,
         marker="o" if len(steps) <= 50 else None,
         markersize=3,
-        label=f"champion, mean of {episodes} evaluation episodes",
+        label=f"mean of {episodes} evaluation episodes",
     )
 
     axes.fill_between(

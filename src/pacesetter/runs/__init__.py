@@ -2,6 +2,7 @@
 
 from pacesetter.runs.directory import (
     FREE_PER_SEED,
+    OLDER,
     SCHEMA,
     WITHOUT_RESULT,
     RunDirectory,
@@ -11,6 +12,7 @@ from pacesetter.runs.log import Row
 
 __all__ = [
     "FREE_PER_SEED",
+    "OLDER",
     "SCHEMA",
     "WITHOUT_RESULT",
     "Row",

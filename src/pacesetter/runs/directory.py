@@ -31,6 +31,8 @@ from pacesetter.settings.validation import difference
 CONFIG = "config.json"
 # Settings that belong to the machine, not to the result; `resume` takes them anew.
 WITHOUT_RESULT = {"checkpoint_every", "device", "env_timeout"}
+# Settings that are newer than some runs, with the value by which those were made.
+OLDER = {"eval_policy": "champion"}
 # Settings in which the seeds of one name may differ.
 HORIZONS = {"replay_horizon", "lr_horizon"}
 FREE_PER_SEED = {"seed", "steps", "time"} | WITHOUT_RESULT | HORIZONS
@@ -191,7 +193,7 @@ class RunDirectory:
 
     def settings(self) -> Row:
         """The run's flat settings."""
-        return self.record()["settings"]
+        return OLDER | self.record()["settings"]
 
     def config(self, allow: Iterable[str] = ()) -> Config:
         """The run's checked settings; `allow` are names that may import a module."""

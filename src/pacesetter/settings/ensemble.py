@@ -89,19 +89,19 @@ class Ensemble:
     eval_policy: Literal["champion", "ema"] = Field(
         "champion",
         description="what is evaluated and saved: the champion's policy, or the mean action of all "
-        "members' EMA actors",
+        "members' actors averaged over time (exponential moving averages, EMA)",
     )
     mean_actions: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="also evaluate the mean action of all members, and that of their EMA actors; "
-        "auto: with several members; on: each member alone too",
+        description="also evaluate the mean action of all members, and that of their EMA actors "
+        "(with --eval-policy ema the champion); auto: with several members; on: each member too",
     )
     ema_tau: float = Field(0.005, gt=0, le=1, description="step of the EMA actors per actor update")
     snapshots: int = Field(
         0,
         ge=0,
         le=100,
-        description="also evaluate the mean action of this many last evaluated champions",
+        description="also evaluate the mean action of the champions of this many evaluations",
     )
 
     @property

@@ -73,11 +73,11 @@ class RunSettings(TypedDict, total=False):
     eval_policy: Literal["champion", "ema"]
     """what is evaluated and saved: the champion's policy, or the mean action of all members'..."""
     mean_actions: Literal["auto", "on", "off"]
-    """also evaluate the mean action of all members, and that of their EMA actors; auto: with..."""
+    """also evaluate the mean action of all members, and that of their EMA actors (with..."""
     ema_tau: float
     """step of the EMA actors per actor update"""
     snapshots: int
-    """also evaluate the mean action of this many last evaluated champions"""
+    """also evaluate the mean action of the champions of this many evaluations"""
     eval_every: int | str
     """env steps between evaluations"""
     eval_episodes: int

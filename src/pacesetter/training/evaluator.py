@@ -65,8 +65,9 @@ class Evaluator:
             scales = [member.scales for member in progress.members]
             values["settings"] = shown(run, self.config.hyper, scales)
         if run.members > 1 and (run.mean_actions == "on" or (ending and run.rule == "none")):
-            played = trial if run.eval_policy == "champion" else None
-            values["members"] = self._each_member(played)
+            beside = means.get("champion", {}).get("mean")
+            known = trial.mean if run.eval_policy == "champion" else beside
+            values["members"] = self._each_member(known)
         self._save(policy, trial)
         self.loop.keep_snapshot(champion)
         return values
@@ -108,12 +109,12 @@ class Evaluator:
             found[name] = {"mean": trial.mean, "std": trial.std, "returns": trial.returns}
         return found
 
-    def _each_member(self, champions: Evaluation | None) -> list[float]:
-        """Mean return of every member on the same starts; the champion may have had its trial."""
+    def _each_member(self, known: float | None) -> list[float]:
+        """Mean return of every member on the same starts; the champion's may be known."""
         champion = self.loop.progress.champion
         return [
-            champions.mean
-            if champions and k == champion
+            known
+            if known is not None and k == champion
             else self._trial(self.policy(k).act, k).mean
             for k in range(self.config.run.members)
         ]

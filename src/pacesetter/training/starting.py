@@ -18,8 +18,8 @@ def start_from(loop: Loop, config: Config, runs: str | Path) -> None:
     """Give every member what `--start-from` names, if it names anything.
 
     The replay, the counters and noise start anew. A run gives the whole state of its champion,
-    optimiser state included, and the statistics that normalize observations and rewards. A policy
-    file gives the actor alone. Raises UsageError if it does not fit this run.
+    optimiser state included but no EMA actor, and the statistics that normalize observations and
+    rewards. A policy file gives the actor alone. Raises UsageError if it does not fit this run.
     """
     if config.run.start_from is None:
         return

@@ -244,9 +244,10 @@ class Trainer:
             )
 
     def policy(self, member: int | None = None) -> Policy:
-        """The policy of the champion, or of a member, and where it comes from.
+        """A member's policy, or what `--eval-policy` names, and where it comes from.
 
-        With `--assess` it is the best that was kept (`about["kept_at"]`), else what it is now.
+        With `--assess` a member's is the best that was kept (`about["kept_at"]`), else what it is
+        now.
         """
         members = self.config.run.members
         if member is not None and not 0 <= member < members:

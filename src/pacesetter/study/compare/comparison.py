@@ -25,6 +25,11 @@ from pacesetter.study.compare.results import Run
 
 # `train` lets the horizon follow from --steps; compared, another horizon is another algorithm.
 _FREE = FREE_PER_SEED - HORIZONS
+EVALUATION = {  # settings of it, and what is true where they differ
+    "eval_every": "evaluations come at other numbers of steps",
+    "eval_episodes": "a mean is of more episodes in some runs than in others",
+    "eval_policy": "some runs evaluate the champion, some the mean of EMA actors",
+}
 MACHINES = {  # what decides CPU seconds
     "threads": "thread counts",
     "machine": "machines",
@@ -203,9 +208,9 @@ def _counted_apart(runs: list[Run], limit: Limit) -> list[str]:
     notes = [f"Every run counts up to {limit}."] if limited else []
     if any(run.settings.get("count_selection_steps") is False for run in runs):
         notes.append("Steps of selection come on top of the env steps where a run left them out.")
-    for key, what in (("eval_every", "evaluations come at"), ("eval_episodes", "episodes differ")):
+    for key, what in EVALUATION.items():
         if len({run.settings.get(key) for run in runs}) > 1:
-            notes.append(f"Settings of the evaluation differ ({key}): {what} other numbers.")
+            notes.append(f"Settings of the evaluation differ ({key}): {what}.")
     return notes + (_unfinished_schedules(runs) if limited else [])
 
 

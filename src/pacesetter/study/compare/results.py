@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from pacesetter.errors import UsageError
-from pacesetter.runs import Row, RunDirectory
+from pacesetter.runs import OLDER, Row, RunDirectory
 from pacesetter.runs.records import check_record
 from pacesetter.settings.budget import budget, is_spent, standing, steps_per_count
 from pacesetter.settings.validation import Finite, Natural, check
@@ -65,9 +65,9 @@ class Run:
     extra: dict[str, Array]
     folder: Path | None = None
 
-    @property
+    @cached_property
     def settings(self) -> Row:
-        return self.table["settings"]
+        return OLDER | self.table["settings"]
 
     @property
     def env(self) -> str:

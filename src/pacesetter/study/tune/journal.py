@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from pacesetter.errors import UsageError
-from pacesetter.runs import WITHOUT_RESULT
+from pacesetter.runs import OLDER, WITHOUT_RESULT
 from pacesetter.runs.lock import Lock, alone, wait_for
 from pacesetter.settings import Settings
 from pacesetter.settings.validation import difference, fields_of
@@ -74,6 +74,7 @@ def open_study(
         study.enqueue_trial({k: v for k, v in usual.items() if searched[k].has(v)})
         return study
     # What changes no score is no difference, nor is a setting that another version did not have.
+    old = OLDER | old
     shared = [key for key in settings if key in old and key not in WITHOUT_RESULT]
     if found := difference(
         old, new, [*shared, *(k for k in {**old, **new} if k.startswith(RANGE))]
