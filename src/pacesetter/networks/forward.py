@@ -7,7 +7,7 @@ import numpy as np
 from pacesetter.types import Floats, Layers
 
 ENCODER = [(f"encoder_kernel_{i}", f"encoder_bias_{i}") for i in (1, 2, 3)]
-NORM_EPSILON = np.float32(1e-5)
+NORM_EPSILON = 1e-5
 LENGTH_EPSILON = np.float32(1e-8)
 
 
