@@ -53,7 +53,12 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "walkers": [{"budget": "30k"}],
     "champions": [{"budget": "100k", "reference": "crossq-small"}],
     "humanoid": [{"budget": "776k", "reference": "multi-td3"}],
-    "ensemble": [{"reference": "single-half"}, {"reference": "single"}, {"reference": "none"}],
+    "ensemble": [
+        {"reference": "single-half"},
+        {"reference": "single-ema-half"},
+        {"reference": "single-ema"},
+        {"reference": "none"},
+    ],
     "peers": [{"budget": "100k", "reference": "sb3-td3"}],
     "stage-2": [{"budget": "100k", "reference": "td7-small-bf16"}, {"budget": "300k"}],
     "rescue": [{"reference": "single"}],
