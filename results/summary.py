@@ -27,7 +27,7 @@ from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
 LEVELS = (2_000, 5_000, 8_000)  # returns whose cost is shown
-LEVELLED = ("frontier", "peers", "stage-2")  # for these studies
+LEVELLED = ("frontier", "peers", "stage-2", "ensemble")  # for these studies
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
     "paper": [{"budget": "1M"}, {"budget": "2M", "reference": "multi-td3"}],
