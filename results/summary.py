@@ -3,6 +3,7 @@
 python results/summary.py                           prints the tables of all studies
 python results/summary.py --study pilot             of one
 python results/summary.py --figures DIR             also draws the curves into DIR/STUDY.pdf
+python results/summary.py --figure-2 FILE           only draws the paper's figure 2
 python results/summary.py --collect pilot RUNS...   first takes finished runs into pilot.jsonl;
                                                     with --unfinished others too
 
@@ -22,7 +23,7 @@ from pacesetter.study.compare.comparison import compare
 from pacesetter.study.compare.groups import Comparison
 from pacesetter.study.compare.results import Run, compact, read
 from pacesetter.study.report import contents, contrasts, paper, tables
-from pacesetter.study.report.figures import pdf
+from pacesetter.study.report.figures import figure_2, pdf
 from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
@@ -66,6 +67,9 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
     "vary-alpha": [{"reference": "alpha-3e-4"}, {"reference": "vary-none"}],
 }
+
+PAPER = ("paper-table-1", "paper")  # the rows of its figure 2, whose curves are smoothed
+SMOOTHED = 5  # evaluations; the paper does not say how many
 
 # Studies of which every policy that was evaluated counts apart.
 APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier")
@@ -181,7 +185,12 @@ def main() -> None:
     parser.add_argument("--collect", metavar=("STUDY", "RUNS"), nargs="+", help="take runs in")
     parser.add_argument("--figures", metavar="DIR", type=Path, help="where to draw curves")
     parser.add_argument("--unfinished", action="store_true", help="collect these runs too")
+    parser.add_argument("--figure-2", metavar="FILE", type=Path, help="draw this, nothing else")
     found = parser.parse_args()
+    if found.figure_2:
+        tables_of_paper = [compare([HERE / f"{one}.jsonl"], mixed=True) for one in PAPER]
+        figure_2(tables_of_paper, SMOOTHED).savefig(found.figure_2, dpi=110)
+        return
     if found.collect:
         study, *folders = found.collect
         if study not in STUDIES or not folders:

@@ -27,6 +27,7 @@ from pacesetter.study.compare.gathering import gather
 from pacesetter.study.compare.groups import Comparison, split
 from pacesetter.study.compare.results import AXES, Run, compact
 from pacesetter.study.report import contents, contrasts, curves, output, paper, tables
+from pacesetter.study.report.figures import figure_2
 from pacesetter.study.report.published import sources
 from pacesetter.training.trainer import Trainer
 
@@ -735,6 +736,28 @@ def test_smoothing_is_said_and_changes_no_number(runs: Path, command: Any) -> No
     assert "Savitzky-Golay" not in b
     rows = [re.findall(r"<td.*?</td>", page) for page in (a, b)]
     assert rows[0] == rows[1]
+
+
+def test_curves_of_one_seed_are_smoothed_though_they_have_no_interval(
+    tmp_path: Path, command: Any
+) -> None:
+    run = make_run(tmp_path, budget=20_000, evaluations=10)
+    for file in ("a.png", "a.pdf", "a.html"):
+        assert command(run, "-o", file, "--no-film", "--smooth", "5")[0] == 0
+        assert Path(file).exists()
+
+
+def test_figure_2_takes_each_pair_from_the_first_comparison_that_has_it(tmp_path: Path) -> None:
+    """The paper's two tables have budgets of their own, so their runs are not pooled."""
+    for name in ("multi-td3", "sunrise"):
+        make_run(tmp_path / "short", "Ant-v4", name, budget=10_000, evaluations=5)
+    for name in ("multi-td3", "td3"):
+        make_run(tmp_path / "long", "Ant-v4", name, budget=90_000, evaluations=5)
+    short, long = (compare([tmp_path / folder]) for folder in ("short", "long"))
+    drawn = figure_2([short, long])
+    panels = [panel for panel in drawn.axes if panel.get_visible()]
+    assert [panel.get_xlabel() for panel in panels] == ["env steps to 10k", "env steps to 90k"]
+    assert figure_2([compare([tmp_path / "short/Ant-v4/sunrise"])]) is None
 
 
 def test_a_picture_is_drawn_against_the_axis_asked_for(runs: Path, command: Any) -> None:

@@ -68,7 +68,7 @@ def smooth(values: Array, window: int) -> Array:
     from scipy.signal import savgol_filter
 
     odd = min(window, len(values)) - (min(window, len(values)) + 1) % 2
-    if odd <= SMOOTHING_ORDER:
+    if odd <= SMOOTHING_ORDER or not np.isfinite(values).all():  # the interval of one seed is NaN
         return values
     return cast("Array", savgol_filter(values, odd, SMOOTHING_ORDER))
 

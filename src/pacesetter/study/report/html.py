@@ -59,7 +59,7 @@ def report(
     )
     first, *rest = own
     alone = len(comparison.envs) == 1
-    drawn = figure_2(comparison, window)
+    drawn = figure_2([comparison], window)
     return library.get_template("report.html.jinja").render(
         title=contents.title(comparison),
         result=headline(comparison),
