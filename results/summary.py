@@ -72,7 +72,7 @@ PAPER = ("paper-table-1", "paper")  # the rows of its figure 2, whose curves are
 SMOOTHED = 5  # evaluations; the paper does not say how many
 
 # Studies of which every policy that was evaluated counts apart.
-APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier")
+APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier", "stage-2")
 
 
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:

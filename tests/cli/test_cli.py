@@ -135,6 +135,12 @@ DEFAULTS = {
         "precision": "bf16",
         "eval-policy": "ema",
     },
+    ("frugal", "Ant-v5"): {
+        "encoder-size": "96",
+        "batch-size": "128",
+        "precision": "bf16",
+        "eval-policy": "ema",
+    },
 }
 
 
@@ -182,7 +188,7 @@ LISTS = {
     "algorithms": ["td3", "ddpg", "multi-td3", "multi-ddpg"],
     "envs": ["HalfCheetah-v5", "Ant-v4", "Humanoid-v5", "pacesetter/Ant111-v4", "module:Id"],
     "rules": ["none", "best", "random", "top_half", "tournament"],
-    "presets": ["td3-paper", "ddpg-original", "quick", "Fujimoto", "Lillicrap"],
+    "presets": ["td3-paper", "ddpg-original", "quick", "frugal", "Fujimoto", "Lillicrap"],
     "suites": ["smoke", "pilot", "published", "paper-table-1", "paper-table-2"],
     "runs": ["no runs below runs"],
 }

@@ -10,7 +10,7 @@ Name = Literal[
     "trpo", "me-trpo", "multi-td3", "multi-td7", "multi-sac", "multi-tqc", "multi-crossq",
     "multi-sunrise", "multi-sunrise-td3", "multi-steve", "multi-steve-td3", "multi-ddpg",
     "td3-paper", "ddpg-original", "crossq-small", "quick", "crossq-lean", "crossq-bins",
-    "crossq-wn", "td7-small", "sunrise-official", "steve-paper", "me-trpo-paper"
+    "crossq-wn", "td7-small", "frugal", "sunrise-official", "steve-paper", "me-trpo-paper"
 ]
 # fmt: on
 
