@@ -28,7 +28,7 @@ from pacesetter.study.report.headline import headline
 
 HERE = Path(__file__).parent
 LEVELS = (2_000, 5_000, 8_000)  # returns whose cost is shown
-LEVELLED = ("frontier", "peers", "stage-2", "ensemble")  # for these studies
+LEVELLED = ("frontier", "peers", "stage-2", "stage-3", "ensemble")  # for these studies
 # What each study is compared at, env steps or CPU time, and with whom if not with td3.
 STUDIES: dict[str, list[dict[str, str]]] = {
     "paper": [{"budget": "1M"}, {"budget": "2M", "reference": "multi-td3"}],
@@ -62,6 +62,7 @@ STUDIES: dict[str, list[dict[str, str]]] = {
     ],
     "peers": [{"budget": "100k", "reference": "sb3-td3"}],
     "stage-2": [{"budget": "100k", "reference": "td7-small-bf16"}, {"budget": "300k"}],
+    "stage-3": [{"reference": "td7-small-ema-bf16"}],
     "rescue": [{"reference": "single"}],
     "cores": [{"reference": "single"}, {"reference": "none-4"}],
     "vary": [{"reference": "gamma-990"}, {"reference": "vary-none"}],
@@ -72,7 +73,7 @@ PAPER = ("paper-table-1", "paper")  # the rows of its figure 2, whose curves are
 SMOOTHED = 5  # evaluations; the paper does not say how many
 
 # Studies of which every policy that was evaluated counts apart.
-APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier", "stage-2")
+APART = ("ensemble", "rescue", "cores", "vary", "vary-alpha", "frontier", "stage-2", "stage-3")
 
 
 def collect(study: str, folders: list[str], unfinished: bool = False) -> None:
