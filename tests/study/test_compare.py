@@ -742,22 +742,39 @@ def test_curves_of_one_seed_are_smoothed_though_they_have_no_interval(
     tmp_path: Path, command: Any
 ) -> None:
     run = make_run(tmp_path, budget=20_000, evaluations=10)
+    found = compare([run])
+    raw, smoothed = (curves.curve(found.groups[0], "steps", window) for window in (None, 5))
+    assert not np.allclose(raw.mean, smoothed.mean)
+    assert np.isnan(smoothed.low).all()
+    assert np.isnan(smoothed.high).all()
     for file in ("a.png", "a.pdf", "a.html"):
         assert command(run, "-o", file, "--no-film", "--smooth", "5")[0] == 0
-        assert Path(file).exists()
 
 
 def test_figure_2_takes_each_pair_from_the_first_comparison_that_has_it(tmp_path: Path) -> None:
     """The paper's two tables have budgets of their own, so their runs are not pooled."""
-    for name in ("multi-td3", "sunrise"):
-        make_run(tmp_path / "short", "Ant-v4", name, budget=10_000, evaluations=5)
-    for name in ("multi-td3", "td3"):
-        make_run(tmp_path / "long", "Ant-v4", name, budget=90_000, evaluations=5)
-    short, long = (compare([tmp_path / folder]) for folder in ("short", "long"))
-    drawn = figure_2([short, long])
-    panels = [panel for panel in drawn.axes if panel.get_visible()]
+    folders = {"short": (10_000, ("multi-td3", "sunrise")), "long": (90_000, ("multi-td3", "td3"))}
+    folders["longest"] = (200_000, ("multi-td3", "td3"))
+    for folder, (budget, names) in folders.items():
+        for name in names:
+            make_run(tmp_path / folder, "Ant-v4", name, budget=budget, evaluations=5)
+    short, long, longest = (compare([tmp_path / folder]) for folder in folders)
+    panels = [panel for panel in figure_2([short, long, longest]).axes if panel.get_visible()]
+    assert [panel.get_title() for panel in panels] == [
+        "Ant, multi-td3 and sunrise",
+        "Ant, multi-td3 and td3",
+    ]
     assert [panel.get_xlabel() for panel in panels] == ["env steps to 10k", "env steps to 90k"]
     assert figure_2([compare([tmp_path / "short/Ant-v4/sunrise"])]) is None
+
+
+def test_figure_2_names_each_algorithm_once_though_a_task_has_two_versions(tmp_path: Path) -> None:
+    for env in ("Ant-v4", "Ant-v5"):
+        for name in ("multi-td3", "td3"):
+            make_run(tmp_path, env, name, budget=10_000, evaluations=5)
+    (panel,) = figure_2([compare([tmp_path], mixed=True)]).axes
+    assert panel.get_title() == "Ant, multi-td3 and td3"
+    assert len(panel.lines) == 4
 
 
 def test_a_picture_is_drawn_against_the_axis_asked_for(runs: Path, command: Any) -> None:

@@ -141,14 +141,15 @@ def figure_2(comparisons: Sequence[Comparison], window: int | None = None) -> An
     shown = {one: groups for one in found if (groups := _pair(comparisons, *one))}
     if not shown:
         return None
-    styles = style([name for one in comparisons for name in one.names])
     columns = [task for task in TASKS if any(task == one for one, _ in shown)]
     rows = [pair for pair in FIGURE_2 if any(pair == one for _, one in shown)]
     figure, panels = grid(len(rows), len(columns))
     for panel in panels.flat:
         panel.set_visible(False)
     for (task, pair), groups in shown.items():
-        _beside(panels[rows.index(pair), columns.index(task)], groups, styles, window)
+        panel = panels[rows.index(pair), columns.index(task)]
+        panel.set_visible(True)
+        _beside(panel, f"{task}, {' and '.join(pair)}", groups, window)
     head(
         figure,
         f"The paper's figure 2: return against env steps of all members, mean over seeds and {BAND}"
@@ -166,17 +167,14 @@ def _pair(comparisons: Sequence[Comparison], task: str, pair: tuple[str, str]) -
     return []
 
 
-def _beside(
-    panel: Any, groups: list[Group], styles: dict[str, tuple[str, str]], window: int | None
-) -> None:
+def _beside(panel: Any, words: str, groups: list[Group], window: int | None) -> None:
     """Curves up to where the shorter one ended."""
-    panel.set_visible(True)
+    styles = style([group.name for group in groups])
     end = min(curve(group, "steps").x[-1] for group in groups)
     for group in groups:
         line = _until(curve(group, "steps", window), end)
         label = f"{group.name} ({split(group.env)[1]}, n={len(group.runs)})"
         draw(panel, line, styles[group.name], label)
-    words = f"{split(groups[0].env)[0]}, {' and '.join(group.name for group in groups)}"
     label_axes(panel, words, f"env steps to {steps(end)}", "return")
     fit_height(panel)
     panel.legend(frameon=False, fontsize="small")
